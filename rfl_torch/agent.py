@@ -1,0 +1,326 @@
+"""The agent of Fig. 1: predictor, controllers and planner behind one object.
+
+Fitting runs the paper's scenario: learn the HMM from a log (section 2.2), drop unused nodes,
+recognise the log (2.3), give its triplets to the nodes' controllers (2.4). Executors (2.5) are made
+from a fitted agent and leave it unchanged.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from rfl_torch import inference, learning
+from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
+from rfl_torch.config import AgentConfig
+from rfl_torch.controllers import (
+    MLPBank,
+    RBFBank,
+    Triplets,
+    assign_reversed,
+    assign_triplets,
+    concatenate,
+    explained,
+    pool_sparse_nodes,
+)
+from rfl_torch.executor import Executor, make_executor
+from rfl_torch.hmm import GridHMM
+from rfl_torch.online_svr import SVRBank
+from rfl_torch.planner import seen_edges
+from rfl_torch.trajectory import Trajectory
+
+Goal = int | NDArray[np.float32] | Callable[[int], bool]
+Bank = MLPBank | RBFBank | SVRBank
+
+REVERSIBLE_SHARE = 0.5
+"""A world is reversible if controllers explain this share of a backwards log's actions."""
+
+MIN_STEPS = 10
+"""Shortest log that is accepted: the coarsest stage still needs a few steps."""
+
+
+class AgentMonitor(learning.LearningMonitor, Protocol):
+    """What `Agent.fit` reports to."""
+
+    def scalar(self, tag: str, value: float, step: int) -> None:
+        """Called with `controllers/loss` once the controllers are learned."""
+
+
+class Agent:
+    """Learns a map and controllers from logs of what a robot saw and did, and goes places."""
+
+    hmm: GridHMM
+    bank: Bank
+    edge_count: Tensor
+    """int64 (N, K): how often the recognised log took each edge."""
+    is_reversible: bool
+    """Whether the log run backwards obeys the same controllers, with opposite actions."""
+
+    def __init__(self, config: AgentConfig | None = None, seed: int = 0) -> None:
+        self.config = AgentConfig() if config is None else config
+        self.seed = seed
+        self.record: list[learning.Progress] = []
+
+    # -- learning ---------------------------------------------------------------------------
+
+    def fit(
+        self, logs: Trajectory | list[Trajectory], monitor: AgentMonitor | None = None
+    ) -> "Agent":
+        """Learn everything from one log or several of the same robot.
+
+        Raises:
+            ValueError: if the logs are empty, too short, of different widths, or hold a reading
+                that never changes.
+        """
+        logs = [logs] if isinstance(logs, Trajectory) else logs
+        self._set_spaces(logs)
+        observations = [torch.from_numpy(self.normalize(log.observations)) for log in logs]
+        config = self.config
+        self.hmm = GridHMM(
+            config.shape, observations[0].shape[1], config.radius, config.metric, config.boundary
+        )
+        learning.start(self.hmm, observations, config.start, self.seed)
+        self.record = learning.learn(self.hmm, observations, config.stages, monitor)
+        learning.prune(self.hmm, observations, config.temperature)
+        self._learn_controllers(logs, observations, monitor)
+        return self
+
+    def _set_spaces(self, logs: list[Trajectory]) -> None:
+        """Fix the normalisation: readings and actions are brought to [0, 1]."""
+        if not logs:
+            raise ValueError("no log was given; record one first.")
+        widths = {(log.observations.shape[1], log.actions.shape[1]) for log in logs}
+        if len(widths) > 1:
+            raise ValueError(
+                f"logs have (readings, actions) {sorted(widths)}; needs the same robot in all."
+            )
+        num_steps = sum(log.num_steps for log in logs)
+        if num_steps < MIN_STEPS * max(stage.stride for stage in self.config.stages):
+            raise ValueError(
+                f"the logs hold {num_steps} steps, too few to sub-sample at "
+                f"1/{max(stage.stride for stage in self.config.stages)}; record thousands, "
+                "e.g. 10000."
+            )
+        observations = np.concatenate([log.observations for log in logs])
+        low, high = np.nanmin(observations, 0), np.nanmax(observations, 0)
+        if (constant := np.flatnonzero(~(high > low))).size:
+            raise ValueError(
+                f"readings {constant.tolist()} never change in the log; they say nothing. Leave "
+                "them out, or check the sensor."
+            )
+        self.observation_low, self.observation_scale = _unit_range(low, high)
+        bounds = [log.bounds for log in logs]
+        self.action_bounds = (
+            np.min([low for low, _ in bounds], 0),
+            np.max([high for _, high in bounds], 0),
+        )
+
+    def _learn_controllers(
+        self, logs: list[Trajectory], observations: list[Tensor], monitor: AgentMonitor | None
+    ) -> None:
+        """Recognise the logs, count the edges they take, train the bank on their triplets.
+
+        Where the controllers so learned predict the log run backwards, the world is reversible:
+        they learn from both directions then, and the planner trusts edges taken one way only.
+        """
+        self._prepare()
+        self.edge_count = torch.zeros(self.hmm.successor.shape, dtype=torch.int64)
+        forward, backward = [], []
+        for log, sequence in zip(logs, observations, strict=True):
+            path = torch.from_numpy(
+                inference.most_likely_path(self._uniform_chain, sequence.numpy())
+            )
+            self._count_edges(path)
+            actions = torch.from_numpy(self._unit_actions(log.actions))
+            samples = (path, sequence.float(), actions, self.config.horizon)
+            forward.append(assign_triplets(*samples))
+            backward.append(assign_reversed(*samples))
+        loss = self._train_bank(concatenate(forward))
+        self.is_reversible = False
+        if self.config.uses_reversal:
+            share = explained(self.bank, concatenate(backward))
+            self.is_reversible = share > REVERSIBLE_SHARE
+        if self.is_reversible:
+            loss = self._train_bank(concatenate(forward + backward))
+        if monitor is not None:
+            monitor.scalar("controllers/loss", loss, len(self.record))
+        self._prepare()
+
+    def _train_bank(self, triplets: Triplets) -> float:
+        pooled = pool_sparse_nodes(triplets, self.hmm.successor, self.hmm.successor_mask)
+        torch.manual_seed(self.seed)
+        self.bank = make_bank(
+            self.config.controller, self.num_nodes, self.hmm.obs_dim, pooled.action.shape[1]
+        )
+        return self.bank.fit(pooled.inputs, pooled.action, pooled.node)
+
+    def _count_edges(self, path: Tensor) -> None:
+        source, target = path[:-1], path[1:]
+        is_edge = (self.hmm.successor[source] == target[:, None]) & self.hmm.successor_mask[source]
+        edge = is_edge.int().argmax(1)
+        self.edge_count.index_put_((source, edge), torch.ones_like(edge), accumulate=True)
+
+    def _prepare(self) -> None:
+        """Lay out what recognition and planning read at every step."""
+        self.chain = self.hmm.chain(self.config.temperature)
+        uniform = np.where(self.chain.is_node, -np.log(self.num_nodes), -np.inf)
+        self._uniform_chain = self.chain._replace(initial_log=uniform)
+        rows, columns = np.nonzero(self.hmm.successor_mask.numpy())
+        target = self.hmm.successor.numpy()[rows, columns]
+        shape = (self.num_nodes, self.num_nodes)
+        prob = self.hmm.log_transition().exp().detach().numpy()[rows, columns]
+        self.transition = csr_array((prob, (rows, target)), shape=shape)
+        self.transition_in = self.transition.T.tocsr()
+        if hasattr(self, "edge_count"):
+            count = self.edge_count.numpy()[rows, columns]
+            counts = csr_array((count, (rows, target)), shape=shape)
+            self.graph = seen_edges(counts, self.is_reversible)
+
+    # -- using ------------------------------------------------------------------------------
+
+    @property
+    def num_nodes(self) -> int:
+        """Nodes kept after pruning."""
+        return self.hmm.num_nodes
+
+    @property
+    def rest_action(self) -> NDArray[np.float32]:
+        """The middle of the action space, (A,)."""
+        low, high = self.action_bounds
+        return ((low + high) / 2).astype(np.float32)
+
+    def normalize(self, observations: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Bring raw readings (..., D) to the range [0, 1] that the log had."""
+        values = np.asarray(observations, np.float64)
+        if values.shape[-1:] != self.observation_low.shape:
+            raise ValueError(
+                f"observation has shape {values.shape}, needs (..., {len(self.observation_low)}) "
+                "as in the log that the agent learned from."
+            )
+        return (values - self.observation_low) / self.observation_scale
+
+    def recognize(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,)."""
+        return inference.most_likely_path(self._uniform_chain, self.normalize(observations))
+
+    def executor(self, goal: Goal, seed: int = 0) -> Executor:
+        """Make the object that drives to `goal`.
+
+        Args:
+            goal: a node's index; an observation (D,), for any place that looks like it; or a
+                predicate on node indices, for the nearest node that fulfils it.
+            seed: of the innate actions that it falls back on.
+        """
+        return make_executor(self, self._goal_nodes(goal), seed)
+
+    def _goal_nodes(self, goal: Goal) -> NDArray[np.int64]:
+        if isinstance(goal, int | np.integer):
+            if not 0 <= goal < self.num_nodes:
+                raise ValueError(f"goal {goal} is no kept node; needs 0 to {self.num_nodes - 1}.")
+            return np.array([goal])
+        if callable(goal):
+            nodes = np.array([node for node in range(self.num_nodes) if goal(node)], np.int64)
+            if not nodes.size:
+                raise ValueError("no kept node fulfils the goal's predicate; widen it.")
+            return nodes
+        normal = self.normalize(np.asarray(goal))
+        if normal.ndim != 1 or np.isnan(normal).all():
+            raise ValueError(
+                f"goal has shape {normal.shape}; needs one observation "
+                f"({len(self.observation_low)},) with at least one reading."
+            )
+        return np.array([self.log_emission(normal).argmax()])
+
+    def log_emission(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Tempered log-density of one normalised observation (D,) under every node, (N,)."""
+        return inference.log_emission(self.chain, normal[None])[0, self.chain.cell]
+
+    def control(self, normal: NDArray[np.float64], node: int) -> NDArray[np.float32]:
+        """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,)."""
+        mean = self.hmm.emission_mean.detach().numpy()[node]
+        observation = np.where(np.isnan(normal), mean, normal)
+        inputs = torch.from_numpy(np.concatenate([observation, mean])[None]).float()
+        with torch.no_grad():
+            unit = self.bank(inputs, torch.tensor([node]))[0].numpy()
+        return self._raw_action(unit)
+
+    def _raw_action(self, unit: NDArray[np.float32]) -> NDArray[np.float32]:
+        """From [0, 1] to the action space; what lies outside is shortened, not bent."""
+        offset = unit - 0.5
+        offset = offset / max(1.0, 2 * float(np.abs(offset).max()))
+        low, high = self.action_bounds
+        return np.clip(low + (offset + 0.5) * (high - low), low, high).astype(np.float32)
+
+    def _unit_actions(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+        low, high = self.action_bounds
+        return ((actions - low) / np.where(high > low, high - low, 1.0)).astype(np.float32)
+
+    # -- keeping ----------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> None:
+        """Write the agent as one safetensors file."""
+        state = {f"hmm.{name}": value for name, value in self.hmm.state_dict().items()}
+        state |= {f"bank.{name}": value for name, value in self.bank.state_dict().items()}
+        state |= {
+            "edge_count": self.edge_count,
+            "is_reversible": torch.tensor(self.is_reversible),
+            "observation_low": torch.from_numpy(self.observation_low),
+            "observation_scale": torch.from_numpy(self.observation_scale),
+            "action_low": torch.from_numpy(self.action_bounds[0]),
+            "action_high": torch.from_numpy(self.action_bounds[1]),
+        }
+        save_checkpoint(Path(path), {"agent": self.config.to_json(), "seed": self.seed}, state)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Agent":
+        """Read an agent that `save` wrote.
+
+        Raises:
+            ValueError: naming the file, if it is damaged or no agent of this version.
+        """
+        config, state = load_checkpoint(Path(path))
+        try:
+            agent = cls(AgentConfig.from_json(config["agent"]), int(config["seed"]))
+            agent._restore(state)
+        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+            raise ValueError(f"{path} is no agent that this version can use: {error}") from None
+        return agent
+
+    def _restore(self, state: dict[str, Tensor]) -> None:
+        config = self.config
+        obs_dim = len(state["observation_low"])
+        self.hmm = GridHMM(config.shape, obs_dim, config.radius, config.metric, config.boundary)
+        self.hmm.restore(_with_prefix(state, "hmm."))
+        self.observation_low = state["observation_low"].numpy()
+        self.observation_scale = state["observation_scale"].numpy()
+        self.action_bounds = (state["action_low"].numpy(), state["action_high"].numpy())
+        self.edge_count = state["edge_count"]
+        self.is_reversible = bool(state["is_reversible"])
+        action_dim = len(state["action_low"])
+        self.bank = make_bank(config.controller, self.num_nodes, obs_dim, action_dim)
+        self.bank.load_state_dict(_with_prefix(state, "bank."))
+        self._prepare()
+
+
+def make_bank(kind: str, num_nodes: int, obs_dim: int, action_dim: int) -> Bank:
+    """An untrained bank of the named kind."""
+    if kind == "mlp":
+        return MLPBank(num_nodes, obs_dim, action_dim)
+    if kind == "svr":
+        return SVRBank(num_nodes, 2 * obs_dim, action_dim, bandwidth=0.5)
+    return RBFBank(num_nodes, obs_dim, action_dim)
+
+
+def _unit_range(
+    low: NDArray[np.float32], high: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return low.astype(np.float64), (high - low).astype(np.float64)
+
+
+def _with_prefix(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}

@@ -1,0 +1,214 @@
+"""Acting until a goal node is reached (section 2.5, execution procedure).
+
+The executor is the one object that keeps state between control steps. It needs no environment:
+a robot's loop calls `act(observation)` once a step and looks at `status`.
+
+    P(s)      belief          probability of every node
+    s(t)      node            the node taken as the current state
+    path(..)  path            planned nodes from the current one to the goal
+    f_j       bank            asked for the controller of the next node on the path
+"""
+
+from collections import deque
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfl_torch import inference
+from rfl_torch.innate import InnateController
+from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
+
+if TYPE_CHECKING:
+    from rfl_torch.agent import Agent
+
+Status = Literal["running", "reached", "gave_up"]
+
+
+class PathExecutor:
+    """The paper's procedure: recognise along the planned path, abort below a threshold, re-plan."""
+
+    def __init__(self, agent: "Agent", goals: NDArray[np.int64], seed: int) -> None:
+        self._agent, self._config = agent, agent.config.executor
+        self.goal = int(goals[0])
+        self._graph = threshold_graph(
+            agent.hmm.transition_matrix().detach().numpy(), self._config.epsilon
+        )
+        self._chain = agent.chain
+        self._window: deque[NDArray[np.float64]] = deque(maxlen=self._config.window)
+        self._innate = InnateController(*agent.action_bounds, seed=seed)
+        self._plans = self._stalled = self._babble_left = 0
+        self.status: Status = "running"
+        self.path: list[int] = []
+        self.node = -1
+        self.belief = np.full(agent.num_nodes, 1.0 / agent.num_nodes)
+        self.recovering = False
+        self.reason = ""
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action of this control step, (A,), inside the action space."""
+        normal = self._agent.normalize(observation)
+        self._window.append(normal)
+        self._recognize()
+        if self.status == "running" and not self.path and self._babble_left == 0:
+            self._plan()
+        if self.status != "running":
+            return self._agent.rest_action
+        if not self.path:
+            self._babble_left -= 1
+            return self._innate.act()
+        following = self.path[1] if len(self.path) > 1 else self.goal
+        return self._agent.control(normal, following)
+
+    def _recognize(self) -> None:
+        """Steps 1-3: Viterbi scores over the window, then the best node of the remaining path."""
+        scores = inference.viterbi_scores(self._chain, np.stack(self._window))
+        self.belief = np.exp(scores - scores.max())
+        self.belief /= self.belief.sum()
+        if not self.path:
+            self.node = int(self.belief.argmax())
+            return
+        best = int(self.belief[self.path].argmax())
+        self.node = self.path[best]
+        self.path = self.path[best:]
+        self._stalled = 0 if best > 0 else self._stalled + 1
+        is_lost = self.belief[self.node] < self._config.abort_probability
+        if is_lost or self._stalled >= self._config.window:
+            self.path, self.node = [], int(self.belief.argmax())
+        elif self.node == self.goal:
+            self.status = "reached"
+
+    def _plan(self) -> None:
+        """Plan anew from the likeliest node; after a null path, babble for a window's length."""
+        self._plans += 1
+        if self._plans > self._config.max_plans:
+            self.status = "gave_up"
+            self.reason = f"{self._config.max_plans} plans were aborted or found no way"
+            return
+        self._stalled = 0
+        self.path = reachability_path(self._graph, self.node, self.goal)
+        self.recovering = not self.path
+        if self.recovering:
+            self._babble_left = self._config.window
+        elif self.node == self.goal:
+            self.status = "reached"
+
+
+class BeliefExecutor:
+    """Filter over all nodes, head for one next node at a time, and learn where the map misleads.
+
+    A next node is kept until it or a cheaper one is recognised: choosing anew at every step, two
+    neighbours that each name the other would hold the robot between them. A next node that is not
+    reached in `patience` steps puts its edge's cost up, in this executor, and the way is planned
+    anew.
+    """
+
+    def __init__(self, agent: "Agent", goals: NDArray[np.int64], seed: int) -> None:
+        self._agent, self._config = agent, agent.config.executor
+        self._goals = goals
+        self.goal = int(goals[0])
+        self._innate = InnateController(*agent.action_bounds, seed=seed)
+        self._cost = agent.graph.copy()
+        self._cost_to_go = cost_to_go(self._cost, goals)
+        self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
+        self._next = -1
+        self._from = -1
+        self._steps_left = 0
+        self._best = np.inf
+        self._failures = 0
+        self._babble_left = 0
+        self.status: Status = "running"
+        self.node = -1
+        self.belief = np.full(agent.num_nodes, 1.0 / agent.num_nodes)
+        self.recovering = False
+        self.reason = ""
+
+    @property
+    def path(self) -> list[int]:
+        """Planned nodes from the likeliest one to the goal; [] while there is no way."""
+        if self.node < 0 or not np.isfinite(self._cost_to_go[self.node]):
+            return []
+        path = [self.node]
+        while path[-1] not in self._goals:
+            path.append(self._cheapest_neighbor(path[-1]))
+        return path
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action of this control step, (A,), inside the action space."""
+        normal = self._agent.normalize(observation)
+        self._recognize(normal)
+        if self.status == "running" and self.belief[self._goals].sum() > 0.5:
+            self.status = "reached"
+        if self.status == "running":
+            self._choose_next()
+        if self.status != "running":
+            return self._agent.rest_action
+        self.recovering = self._babble_left > 0
+        if self.recovering:
+            self._babble_left -= 1
+            return self._innate.act()
+        return self._agent.control(normal, self._next)
+
+    def _recognize(self, normal: NDArray[np.float64]) -> None:
+        """Filter: push the belief over the edges, allow a teleport, weigh by the emission."""
+        teleport = self._config.teleport
+        pushed = self._agent.transition_in @ self.belief
+        predicted = (1 - teleport) * pushed + teleport / len(pushed)
+        log_belief = np.log(predicted) + self._agent.log_emission(normal)
+        belief = np.exp(log_belief - log_belief.max())
+        self.belief = belief / belief.sum()
+        self.node = int(self.belief.argmax())
+
+    def _cheapest_neighbor(self, node: int) -> int:
+        """The neighbour over which the goal is cheapest."""
+        row = slice(self._cost.indptr[node], self._cost.indptr[node + 1])
+        neighbor = self._cost.indices[row]
+        return int(neighbor[(self._cost.data[row] + self._cost_to_go[neighbor]).argmin()])
+
+    def _choose_next(self) -> None:
+        """Keep the next node while it is worth it; else plan from where the robot is."""
+        if self._babble_left > 0:
+            return
+        if self._distance[self.node] < self._best:
+            self._best, self._failures = self._distance[self.node], 0
+        is_pursued = self._next >= 0 and self._next != self.node
+        if is_pursued and self._cost_to_go[self.node] > self._cost_to_go[self._next]:
+            self._steps_left -= 1
+            if self._steps_left > 0:
+                return
+            self._blame()
+            if self.status != "running" or self._babble_left > 0:
+                return
+        if not np.isfinite(self._cost_to_go[self.node]):
+            self._fail("no way is known from here")
+            return
+        self._from, self._next = self.node, self._cheapest_neighbor(self.node)
+        self._steps_left = self._config.patience
+
+    def _blame(self) -> None:
+        """Raise the cost of the edge that led nowhere, plan anew, count the failure."""
+        row = slice(self._cost.indptr[self._from], self._cost.indptr[self._from + 1])
+        is_edge = self._cost.indices[row] == self._next
+        self._cost.data[row][is_edge] *= self._config.blame
+        self._cost_to_go = cost_to_go(self._cost, self._goals)
+        self._fail("no closer to the goal")
+
+    def _fail(self, reason: str) -> None:
+        """Count a failure; the more in a row, the longer the innate actions take over."""
+        self._failures += 1
+        self._next = -1
+        if self._failures > self._config.max_plans:
+            self.status = "gave_up"
+            self.reason = f"{reason} after {self._failures - 1} plans"
+        elif self._failures > 1:
+            self._babble_left = min(2 * self._failures, 20)
+
+
+Executor = PathExecutor | BeliefExecutor
+
+
+def make_executor(agent: "Agent", goals: NDArray[np.int64], seed: int) -> Executor:
+    """The executor that the agent's configuration asks for."""
+    if agent.config.executor.recognition == "path":
+        return PathExecutor(agent, goals, seed)
+    return BeliefExecutor(agent, goals, seed)

@@ -1,0 +1,386 @@
+"""The sparsely-connected hidden Markov model of section 2.2.
+
+    node i       a hidden state, standing on a lattice cell
+    pi_i         initial_prob        softmax(initial_logits)
+    a_ij         transition_prob     softmax of transition_logits over the edges that exist
+    mu_j         emission_mean
+    sigma_j      emission_scale      exp(emission_log_scale), a standard deviation
+
+Parameters are float64: a long log's likelihood and a sharp Gaussian's density need it, and the
+work is done by `inference`, whatever the parameters' type.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rfl_torch import inference
+from rfl_torch.grid import Boundary, Metric, build_grid
+
+MIN_WEIGHT = 1e-8
+"""Expected visits under which a node counts as unseen: the messages flush at 2**-126 a step, so the
+ratios of smaller counts are rounding, not data."""
+
+MAX_READING = 1e15
+"""Largest reading taken: far larger ones overflow when squared, and are wrong units anyway."""
+
+Sequences = Tensor | np.ndarray | list[Tensor] | list[np.ndarray]
+
+MIN_LOG_PROB = -200.0
+"""Where an edge's log-probability is floored: EM's zeros absorb, and a floor this far down changes
+no sum, yet leaves every allowed path possible."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Expected sufficient statistics of an E-step; statistics of several logs add.
+
+    initial (N,), node (N,), edge (N, K): expected counts of the first node, of every node, of
+    every transition. weight, first, second (N, D): expected count, sum and sum of squares of the
+    readings that are not missing. log_likelihood (): natural log of a density, summed over steps,
+    so positive values are normal.
+    """
+
+    initial: Tensor
+    node: Tensor
+    edge: Tensor
+    weight: Tensor
+    first: Tensor
+    second: Tensor
+    log_likelihood: Tensor
+    num_steps: float
+
+    def __add__(self, other: "Statistics") -> "Statistics":
+        """Pool the statistics of two sets of sequences under one model."""
+        names = [field.name for field in fields(self)]
+        return Statistics(**{name: getattr(self, name) + getattr(other, name) for name in names})
+
+    def scaled(self, factor: float) -> "Statistics":
+        """Count every step `factor` times: below 1 it forgets."""
+        names = [field.name for field in fields(self)]
+        return Statistics(**{name: getattr(self, name) * factor for name in names})
+
+
+class Sample(NamedTuple):
+    """A path drawn from the model: nodes int64 (T,), observations float64 (T, D)."""
+
+    nodes: Tensor
+    observations: Tensor
+
+
+class GridHMM(nn.Module):
+    """An HMM whose nodes lie on a square grid or cubic lattice and are joined to their neighbours.
+
+    Starts with the paper's values: uniform transitions over the edges, equal means 0.5 and scales
+    0.05 for every node.
+
+    Args:
+        shape: two sizes for a square grid, three for a cubic lattice.
+        obs_dim: readings in an observation, D.
+        radius: the paper's theta_d, in lattice spacings.
+        metric: "euclidean" as the paper has it, or "chebyshev".
+        boundary: "open", or "torus" to join opposite borders.
+    """
+
+    transition_logits: nn.Parameter
+    emission_mean: nn.Parameter
+    emission_log_scale: nn.Parameter
+    initial_logits: nn.Parameter
+    successor: Tensor
+    successor_mask: Tensor
+    cell: Tensor
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        obs_dim: int,
+        radius: float = 2.0,
+        metric: Metric = "euclidean",
+        boundary: Boundary = "open",
+    ) -> None:
+        super().__init__()
+        if obs_dim < 1:
+            raise ValueError(f"obs_dim is {obs_dim}, needs at least one reading.")
+        grid = build_grid(shape, radius, metric, boundary)
+        self.shape, self.radius, self.metric, self.boundary = tuple(shape), radius, metric, boundary
+        self.num_cells = len(grid.successor)
+        self._set_graph(
+            torch.from_numpy(grid.successor),
+            torch.from_numpy(grid.mask),
+            torch.arange(self.num_cells),
+        )
+        num_nodes, num_edges = self.successor.shape
+        self.transition_logits = nn.Parameter(
+            torch.zeros(num_nodes, num_edges, dtype=torch.float64)
+        )
+        self.initial_logits = nn.Parameter(torch.zeros(num_nodes, dtype=torch.float64))
+        self.emission_mean = nn.Parameter(torch.full((num_nodes, obs_dim), 0.5).double())
+        self.emission_log_scale = nn.Parameter(
+            torch.full((num_nodes, obs_dim), 0.05).double().log()
+        )
+
+    def _set_graph(self, successor: Tensor, mask: Tensor, cell: Tensor) -> None:
+        self.register_buffer("successor", successor)
+        self.register_buffer("successor_mask", mask)
+        self.register_buffer("cell", cell)
+        self._sort_edges()
+
+    def _sort_edges(self) -> None:
+        self._diagonals = inference.build_diagonals(
+            self.successor.numpy(), self.successor_mask.numpy(), self.cell.numpy(), self.num_cells
+        )
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._sort_edges()  # the loaded graph may be another one of the same size
+
+    @property
+    def num_nodes(self) -> int:
+        """Nodes left after pruning."""
+        return len(self.cell)
+
+    @property
+    def obs_dim(self) -> int:
+        """Readings in an observation."""
+        return self.emission_mean.shape[1]
+
+    @property
+    def emission_scale(self) -> Tensor:
+        """Standard deviations, (N, D)."""
+        return self.emission_log_scale.exp()
+
+    def log_transition(self) -> Tensor:
+        """Log-probabilities of the edges, (N, K); -inf where there is none."""
+        logits = self.transition_logits.masked_fill(~self.successor_mask, -torch.inf)
+        return logits.log_softmax(-1)
+
+    def transition_matrix(self) -> Tensor:
+        """Dense a_ij, (N, N); rows sum to one."""
+        dense = torch.zeros(self.num_nodes, self.num_nodes, dtype=self.transition_logits.dtype)
+        return dense.scatter_add(1, self.successor, self.log_transition().exp())
+
+    @torch.no_grad()
+    def chain(self, temperature: float = 1.0) -> inference.Chain:
+        """The parameters laid out for `inference`; emissions raised to `temperature`."""
+        return inference.build_chain(
+            self._diagonals,
+            self.log_transition().double().clamp(min=MIN_LOG_PROB).numpy(),
+            self.initial_logits.double().log_softmax(0).clamp(min=MIN_LOG_PROB).numpy(),
+            self.emission_mean.double().numpy(),
+            self.emission_scale.double().numpy(),
+            self.cell.numpy(),
+            self.num_cells,
+            temperature,
+        )
+
+    def e_step(self, observations: Sequences, temperature: float = 1.0) -> Statistics:
+        """Expected sufficient statistics under the present parameters (eqs. 2-10).
+
+        Args:
+            observations: (T, D), or a list of such sequences of any lengths; NaN is a missing
+                reading.
+            temperature: power of the emission densities; below 1 the transitions count for more.
+        """
+        chain = self.chain(temperature)
+        total = [self._expect(chain, sequence) for sequence in self._sequences(observations)]
+        return sum(total[1:], total[0])
+
+    def _expect(self, chain: inference.Chain, sequence: np.ndarray) -> Statistics:
+        found = inference.expectations(chain, self._diagonals, sequence)
+        edge = torch.zeros(self.successor.shape, dtype=torch.float64)
+        edge[self._diagonals.edge[:, 0], self._diagonals.edge[:, 1]] = torch.from_numpy(found.edge)
+        return Statistics(
+            torch.from_numpy(found.initial),
+            torch.from_numpy(found.node),
+            edge,
+            torch.from_numpy(found.weight),
+            torch.from_numpy(found.first),
+            torch.from_numpy(found.second),
+            torch.tensor(found.log_likelihood, dtype=torch.float64),
+            len(sequence),
+        )
+
+    @torch.no_grad()
+    def m_step(
+        self,
+        statistics: Statistics,
+        *,
+        min_scale: float = 0.01,
+        pseudo_count: float = 0.0,
+        trace: float = 0.0,
+        fixed: frozenset[str] = frozenset(),
+    ) -> None:
+        """Set the parameters to what the statistics say (eqs. 7-11).
+
+        A node or a reading without data keeps its parameters.
+
+        Args:
+            statistics: from `e_step`, added over logs.
+            min_scale: floor of the standard deviations.
+            pseudo_count: transitions that every existing edge is taken to have had beforehand.
+            trace: tau of eq. 11, the share of the old means and variances that is kept.
+            fixed: names of parameters to leave alone.
+        """
+        if "initial_logits" not in fixed:
+            prob = statistics.initial / statistics.initial.sum()
+            self.initial_logits.copy_(prob.log().clamp(min=MIN_LOG_PROB))
+        if "transition_logits" not in fixed:
+            counts = (statistics.edge + pseudo_count) * self.successor_mask
+            total = counts.sum(1, keepdim=True)
+            log_prob = (counts / total).log().clamp(min=MIN_LOG_PROB)
+            known = (total > MIN_WEIGHT) & self.successor_mask
+            self.transition_logits.copy_(torch.where(known, log_prob, self.transition_logits))
+        known = statistics.weight > MIN_WEIGHT
+        weight = torch.where(known, statistics.weight, 1.0)
+        mean = statistics.first / weight
+        variance = (statistics.second / weight - mean**2).clamp(min=min_scale**2)
+        mean = (1 - trace) * mean + trace * self.emission_mean
+        variance = (1 - trace) * variance + trace * self.emission_scale**2
+        variance = variance.clamp(min=min_scale**2)
+        if "emission_mean" not in fixed:
+            self.emission_mean.copy_(torch.where(known, mean, self.emission_mean))
+        if "emission_log_scale" not in fixed:
+            log_scale = 0.5 * variance.log()
+            self.emission_log_scale.copy_(torch.where(known, log_scale, self.emission_log_scale))
+
+    def log_likelihood(self, observations: Sequences) -> Tensor:
+        """Natural log of the observations' density, () [nat], summed over steps and sequences."""
+        chain = self.chain()
+        parts = [
+            inference.filter_rows(chain, sequence)[1] for sequence in self._sequences(observations)
+        ]
+        return torch.tensor(sum(parts), dtype=torch.float64)
+
+    def filter(self, observations: Tensor | np.ndarray) -> Tensor:
+        """p(node at t | observations up to t), float32 (T, N)."""
+        rows, _ = inference.filter_rows(self.chain(), self._sequence(observations))
+        return torch.from_numpy(rows[:, self.cell.numpy()])
+
+    def smooth(self, observations: Tensor | np.ndarray) -> Tensor:
+        """p(node at t | all observations), float32 (T, N)."""
+        return torch.from_numpy(inference.smooth(self.chain(), self._sequence(observations)))
+
+    def most_likely_path(
+        self, observations: Tensor | np.ndarray, temperature: float = 1.0
+    ) -> Tensor:
+        """Viterbi's path (section 2.3) from a uniform start, int64 (T,)."""
+        chain = self.chain(temperature)
+        uniform = np.where(chain.is_node, -np.log(self.num_nodes), -np.inf)
+        path = inference.most_likely_path(
+            chain._replace(initial_log=uniform), self._sequence(observations)
+        )
+        return torch.from_numpy(path)
+
+    def forecast(self, belief: Tensor, num_steps: int) -> Tensor:
+        """p(node n steps ahead) for n = 1..num_steps, (num_steps, N), from a belief (N,)."""
+        transition_prob = self.log_transition().exp()
+        rows = []
+        for _ in range(num_steps):
+            belief = self._push(belief, transition_prob)
+            rows.append(belief)
+        return torch.stack(rows) if rows else belief.new_zeros(0, self.num_nodes)
+
+    def forecast_observation(self, belief: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (..., D) of the observation under a belief (..., N)."""
+        belief = belief.to(self.emission_mean.dtype)
+        mean = belief @ self.emission_mean
+        second = belief @ (self.emission_scale**2 + self.emission_mean**2)
+        return mean, (second - mean**2).clamp(min=0.0).sqrt()
+
+    def _push(self, belief: Tensor, transition_prob: Tensor) -> Tensor:
+        flow = belief.to(transition_prob.dtype)[:, None] * transition_prob
+        return torch.zeros_like(flow[:, 0]).index_add(0, self.successor.flatten(), flow.flatten())
+
+    @torch.no_grad()
+    def update(self, belief: Tensor, observation: Tensor | np.ndarray) -> Tensor:
+        """One control step of the filter: p(node | ..., observation), (N,), from the belief."""
+        sequence = self._sequence(observation[None])
+        log_rows = inference.log_emission(self.chain(), sequence)[:, self.cell.numpy()]
+        # What float64 has flushed to zero stays possible: a teleport may need it.
+        belief = belief.double().clamp(min=1e-300)
+        predicted = self._push(belief, self.log_transition().exp())
+        return (predicted.log() + torch.from_numpy(log_rows[0])).softmax(0)
+
+    @torch.no_grad()
+    def sample(self, num_steps: int, generator: torch.Generator) -> Sample:
+        """Draw a path and its observations."""
+        transition_prob, nodes = self.log_transition().exp(), []
+        node = torch.multinomial(self.initial_logits.softmax(0), 1, generator=generator)
+        for _ in range(num_steps):
+            nodes.append(node)
+            edge = torch.multinomial(transition_prob[node[0]], 1, generator=generator)
+            node = self.successor[node[0], edge]
+        path = torch.cat(nodes)
+        noise = torch.randn(num_steps, self.obs_dim, generator=generator, dtype=torch.float64)
+        return Sample(path, self.emission_mean[path] + noise * self.emission_scale[path])
+
+    @torch.no_grad()
+    def keep_nodes(self, kept: Tensor) -> None:
+        """Drop every node that the bool mask `kept` (N,) leaves out, with its edges."""
+        if not kept.any():
+            raise ValueError("no node would be left; keep at least one.")
+        index = kept.cumsum(0) - 1
+        mask = (self.successor_mask & kept[self.successor])[kept]
+        own = torch.arange(len(mask))[:, None]
+        successor = torch.where(mask, index[self.successor[kept]], own)
+        self._set_graph(successor, mask, self.cell[kept])
+        for name, parameter in list(self.named_parameters()):
+            setattr(self, name, nn.Parameter(parameter[kept]))
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over the `state_dict` of a model of the same lattice, pruned or not.
+
+        Raises:
+            ValueError: if the tensors don't fit together or contradict the lattice.
+        """
+        successor, mask, cell = state["successor"], state["successor_mask"], state["cell"]
+        num_nodes, width = len(cell), self.successor.shape[1]
+        shapes = {
+            "successor": (num_nodes, width),
+            "successor_mask": (num_nodes, width),
+            "transition_logits": (num_nodes, width),
+            "initial_logits": (num_nodes,),
+            "emission_mean": (num_nodes, self.obs_dim),
+            "emission_log_scale": (num_nodes, self.obs_dim),
+        }
+        for name, shape in shapes.items():
+            if tuple(state[name].shape) != shape:
+                raise ValueError(f"{name} has shape {tuple(state[name].shape)}, needs {shape}")
+        in_lattice = (cell >= 0) & (cell < self.num_cells)
+        if not in_lattice.all() or len(cell.unique()) != num_nodes or mask.dtype != torch.bool:
+            raise ValueError(f"cells must be distinct and lie in 0..{self.num_cells - 1}")
+        if not ((successor >= 0) & (successor < num_nodes)).all() or not mask.any(1).all():
+            raise ValueError(f"successors must lie in 0..{num_nodes - 1}, one for each node")
+        if not all(state[name].isfinite().all() for name, _ in self.named_parameters()):
+            raise ValueError("parameters must be finite")
+        self._set_graph(successor, mask, cell)
+        for name, _ in list(self.named_parameters()):
+            setattr(self, name, nn.Parameter(state[name]))
+
+    def _sequences(self, observations: Sequences) -> list[np.ndarray]:
+        sequences = observations if isinstance(observations, list) else [observations]
+        if not sequences:
+            raise ValueError("no sequence of observations was given; give at least one (T, D).")
+        return [self._sequence(sequence) for sequence in sequences]
+
+    def _sequence(self, observations: Tensor | np.ndarray) -> np.ndarray:
+        """Check one sequence and bring it to float64, contiguous."""
+        if isinstance(observations, Tensor):
+            observations = observations.detach().cpu().numpy()
+        array = np.ascontiguousarray(observations, np.float64)
+        if array.ndim != 2 or array.shape[1] != self.obs_dim or len(array) == 0:
+            raise ValueError(
+                f"observations have shape {array.shape}, need (T, {self.obs_dim}) with T >= 1; "
+                "give one row a step."
+            )
+        is_wild = np.abs(array) > MAX_READING
+        if is_wild.any():
+            t, d = np.argwhere(is_wild)[0]
+            raise ValueError(
+                f"observation {t}, reading {d} is {array[t, d]:g}, needs a finite number under "
+                f"{MAX_READING:g}; check its units, or mark a missing reading with NaN."
+            )
+        return array

@@ -1,0 +1,121 @@
+"""The innate controller: random actions before anything is learned, and the log they make.
+
+Section 3.1 draws an action uniformly at every step; section 4.1 switches the torque among
+{-max, 0, max} every 30 steps. Both are `hold` and `levels` of one controller.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfl_torch.trajectory import Trajectory
+
+
+class InnateController:
+    """Draws an action and holds it for `hold` steps.
+
+    Args:
+        low, high: bounds of the action space, (A,).
+        hold: steps that each action is held.
+        levels: None draws uniformly; 3 draws each dimension from {low, middle, high}, and so on.
+        seed: of the draws.
+    """
+
+    def __init__(
+        self,
+        low: NDArray[np.float32],
+        high: NDArray[np.float32],
+        hold: int = 1,
+        levels: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        if hold < 1 or (levels is not None and levels < 2):
+            raise ValueError(
+                f"hold is {hold} and levels {levels}; need hold >= 1 and levels >= 2 or None."
+            )
+        self.low, self.high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+        self.hold, self.levels = hold, levels
+        self._rng = np.random.default_rng(seed)
+        self._left = 0
+
+    def act(self) -> NDArray[np.float32]:
+        """Return the action of this step, (A,)."""
+        if self._left == 0:
+            self._left = self.hold
+            if self.levels is None:
+                share = self._rng.random(self.low.shape)
+            else:
+                share = self._rng.integers(self.levels, size=self.low.shape) / (self.levels - 1)
+            drawn = self.low + share * (self.high - self.low)
+            self._action = np.clip(drawn.astype(np.float32), self.low, self.high)
+        self._left -= 1
+        return self._action
+
+
+def record(
+    env: Any,
+    num_steps: int,
+    hold: int = 1,
+    seed: int = 0,
+    levels: int | None = None,
+    progress: Callable[[range], Iterable[int]] = iter,
+) -> Trajectory:
+    """Drive a Gymnasium environment with innate actions and log what it shows.
+
+    Args:
+        env: one-dimensional Box observations and actions; rewards are not looked at. An
+            `info["ground_truth"]` is logged beside the observations, for scoring.
+        num_steps: control steps.
+        hold: steps that each action is held.
+        seed: of the environment and of the actions.
+        levels: see `InnateController`.
+        progress: wraps the range of steps, as `tqdm.tqdm` does.
+
+    Raises:
+        ValueError: if the spaces are of another kind, or an episode ends before `num_steps`.
+    """
+    check_spaces(env)
+    if num_steps < 1:
+        raise ValueError(f"num_steps is {num_steps}, needs at least 1; try 10000.")
+    space = env.action_space
+    innate = InnateController(space.low, space.high, hold, levels, seed)
+    observation, info = env.reset(seed=seed)
+    observations, actions, truths = [observation], [], [info.get("ground_truth")]
+    for step in progress(range(num_steps)):
+        action = innate.act()
+        observation, _, terminated, truncated, info = env.step(action)
+        actions.append(action)
+        observations.append(observation)
+        truths.append(info.get("ground_truth"))
+        if (terminated or truncated) and step + 1 < num_steps:
+            raise ValueError(
+                f"the episode ended at step {step + 1} of {num_steps}; a log is one unbroken run. "
+                "Make the environment with a larger max_episode_steps, or record several logs."
+            )
+    return Trajectory(
+        np.stack(observations),
+        np.stack(actions),
+        space.low,
+        space.high,
+        None if truths[0] is None else np.stack(truths),
+    )
+
+
+def check_spaces(env: Any) -> None:
+    """Refuse an environment whose observations or actions are no bounded vectors of numbers."""
+    for name, space in (("observation", env.observation_space), ("action", env.action_space)):
+        shape = getattr(space, "shape", None)
+        if type(space).__name__ != "Box" or shape is None or len(shape) != 1 or shape[0] == 0:
+            raise ValueError(
+                f"the {name} space is {space}; needs a Box of shape (n,). Wrap the environment: "
+                "gymnasium.wrappers.FlattenObservation flattens images and dictionaries, "
+                "TransformAction turns other actions into a Box."
+            )
+    space = env.action_space
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise ValueError(
+            f"the action space is {space}, without bounds; random actions need finite ones. Wrap "
+            "the environment with gymnasium.wrappers.RescaleAction or ClipAction."
+        )

@@ -1,0 +1,64 @@
+"""Paths over the learned graph (section 2.5).
+
+Two planners with one result: `reachability_path` is the paper's, which propagates "can be reached"
+over transitions above epsilon and takes the first path; `Navigator` holds the cheapest cost from
+every node to a goal, so that each control step can look its next node up.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
+
+UNTRIED, REVERSED = 3.0, 10.0
+"""Cost of an edge that was only ever taken the other way, in a reversible world and in another."""
+
+
+def threshold_graph(transition: NDArray[np.float64], epsilon: float) -> csr_array:
+    """Edges whose probability is above `epsilon`, at cost 1, without self loops; (N, N)."""
+    adjacency = (transition > epsilon).astype(np.float64)
+    np.fill_diagonal(adjacency, 0.0)
+    return csr_array(adjacency)
+
+
+def seen_edges(count: csr_array, is_reversible: bool) -> csr_array:
+    """Costs of the edges that were taken, or taken the other way round; (N, N) from counts.
+
+    An edge costs 1 and the more the rarer it was taken. One that was taken in the other direction
+    only may be passable too: in a world found reversible it costs UNTRIED, else REVERSED, and is
+    tried where nothing else leads on.
+    """
+    taken = count.astype(np.float64).tocoo()
+    is_edge = (taken.data > 0) & (taken.row != taken.col)
+    row, column = taken.row[is_edge], taken.col[is_edge]
+    cost = csr_array((1.0 + 1.0 / taken.data[is_edge], (row, column)), shape=count.shape)
+    backward = csr_array((np.ones(len(row)), (column, row)), shape=count.shape)
+    untried = backward - backward.multiply(cost > 0)
+    return csr_array(cost + (UNTRIED if is_reversible else REVERSED) * untried)
+
+
+def reachability_path(graph: csr_array, start: int, goal: int) -> list[int]:
+    """The paper's plan: nodes from start to goal over the fewest edges, [] if there is no way.
+
+    Propagating ones and backtracking, as steps 2-5 do, is a breadth-first search.
+    """
+    if start == goal:
+        return [start]
+    _, before = breadth_first_order(graph, start, return_predecessors=True)
+    if before[goal] < 0:
+        return []
+    path = [goal]
+    while path[-1] != start:
+        path.append(int(before[path[-1]]))
+    return path[::-1]
+
+
+def cost_to_go(graph: csr_array, goals: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Cheapest cost from every node to the nearest of `goals`, (N,); inf where there is no way."""
+    return np.asarray(dijkstra(graph.T.tocsr(), indices=goals, min_only=True))
+
+
+def largest_component(graph: csr_array) -> NDArray[np.bool_]:
+    """The nodes of the largest strongly connected component, bool (N,)."""
+    _, label = connected_components(graph, connection="strong")
+    return label == np.bincount(label).argmax()
