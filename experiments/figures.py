@@ -142,7 +142,9 @@ def draw_map(
         wide_label = f"{is_wide.sum()} spread over more than {WORMHOLE_SPREAD:g} mm"
         groups.append((is_wide, RED, wide_label))
     for members, colour, label in groups:
-        axes.plot(*node_position[members].T, "o", color=colour, mec="white", mew=0.5, label=label)
+        axes.plot(
+            *node_position[members].T, "o", color=colour, mec="white", mew=0.4, ms=4, label=label
+        )
     _finish(figure, path)
 
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from rfl_torch import inference, learning
@@ -31,7 +31,7 @@ from rfl_torch.controllers import (
 from rfl_torch.executor import Executor, make_executor
 from rfl_torch.hmm import GridHMM
 from rfl_torch.online_svr import SVRBank
-from rfl_torch.planner import seen_edges
+from rfl_torch.planner import look_alikes, seen_edges
 from rfl_torch.trajectory import Trajectory
 
 Goal = int | NDArray[np.float32] | Callable[[int], bool]
@@ -39,6 +39,9 @@ Bank = MLPBank | RBFBank | SVRBank
 
 REVERSIBLE_SHARE = 0.5
 """A world is reversible if controllers explain this share of a backwards log's actions."""
+
+HOP_PROBABILITY = 0.05
+"""Chance a step that the belief changes over to a node that looks the same."""
 
 MIN_STEPS = 10
 """Shortest log that is accepted: the coarsest stage still needs a few steps."""
@@ -85,8 +88,10 @@ class Agent:
             config.shape, observations[0].shape[1], config.radius, config.metric, config.boundary
         )
         learning.start(self.hmm, observations, config.start, self.seed)
-        self.record = learning.learn(self.hmm, observations, config.stages, monitor)
-        learning.prune(self.hmm, observations, config.temperature)
+        power = config.power(self.hmm.obs_dim)
+        stages = tuple(stage.tempered(power) for stage in config.stages)
+        self.record = learning.learn(self.hmm, observations, stages, monitor)
+        learning.prune(self.hmm, observations, power)
         self._learn_controllers(logs, observations, monitor)
         return self
 
@@ -128,7 +133,7 @@ class Agent:
         Where the controllers so learned predict the log run backwards, the world is reversible:
         they learn from both directions then, and the planner trusts edges taken one way only.
         """
-        self._prepare()
+        self._prepare_recognition()
         self.edge_count = torch.zeros(self.hmm.successor.shape, dtype=torch.int64)
         forward, backward = [], []
         for log, sequence in zip(logs, observations, strict=True):
@@ -149,7 +154,7 @@ class Agent:
             loss = self._train_bank(concatenate(forward + backward))
         if monitor is not None:
             monitor.scalar("controllers/loss", loss, len(self.record))
-        self._prepare()
+        self._prepare_planning()
 
     def _train_bank(self, triplets: Triplets) -> float:
         pooled = pool_sparse_nodes(triplets, self.hmm.successor, self.hmm.successor_mask)
@@ -165,21 +170,63 @@ class Agent:
         edge = is_edge.int().argmax(1)
         self.edge_count.index_put_((source, edge), torch.ones_like(edge), accumulate=True)
 
-    def _prepare(self) -> None:
-        """Lay out what recognition and planning read at every step."""
-        self.chain = self.hmm.chain(self.config.temperature)
+    def _prepare_recognition(self) -> None:
+        self.chain = self.hmm.chain(self.config.power(self.hmm.obs_dim))
         uniform = np.where(self.chain.is_node, -np.log(self.num_nodes), -np.inf)
         self._uniform_chain = self.chain._replace(initial_log=uniform)
+
+    def _prepare_planning(self) -> None:
+        """Lay out the graph that is planned over, and the transitions of the belief."""
         rows, columns = np.nonzero(self.hmm.successor_mask.numpy())
         target = self.hmm.successor.numpy()[rows, columns]
         shape = (self.num_nodes, self.num_nodes)
         prob = self.hmm.log_transition().exp().detach().numpy()[rows, columns]
-        self.transition = csr_array((prob, (rows, target)), shape=shape)
-        self.transition_in = self.transition.T.tocsr()
-        if hasattr(self, "edge_count"):
-            count = self.edge_count.numpy()[rows, columns]
-            counts = csr_array((count, (rows, target)), shape=shape)
-            self.graph = seen_edges(counts, self.is_reversible)
+        count = csr_array((self.edge_count.numpy()[rows, columns], (rows, target)), shape=shape)
+        seen = seen_edges(count, self.is_reversible)
+        self.alike = self._look_alikes(seen)
+        self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)
+        self.transition_in = self._with_hops(csr_array((prob, (rows, target)), shape=shape))
+
+    def _steps_between(self, edges: csr_array) -> csr_array:
+        """Control steps that each edge should take, (N, N) on the same edges.
+
+        In a reversible world the controllers say: what j's asks for at i's mean, before it is
+        shortened to the action space, is that many full actions. An edge over a wormhole then
+        costs what the way costs. Elsewhere an edge counts as one step.
+        """
+        source, target = edges.tocoo().coords
+        steps = np.ones(len(source))
+        if self.is_reversible:
+            mean = self.hmm.emission_mean.detach().float()
+            inputs = torch.cat([mean[source], mean[target]], 1)
+            with torch.no_grad():
+                unit = self.bank(inputs, torch.from_numpy(target).long())
+            steps = np.maximum(1.0, 2.0 * (unit - 0.5).abs().max(1).values.double().numpy())
+        return csr_array((steps, (source, target)), shape=edges.shape)
+
+    def _look_alikes(self, seen: csr_array) -> csr_array:
+        """Nodes that may be one place twice; none where a log can't run backwards.
+
+        Nodes with an edge between them are neighbours, not doubles.
+
+        There nodes that look the same differ in what doesn't show, as a velocity does.
+        """
+        if not self.is_reversible:
+            return csr_array((self.num_nodes, self.num_nodes), dtype=bool)
+        alike = look_alikes(
+            self.hmm.emission_mean.detach().numpy(),
+            self.hmm.emission_scale.detach().numpy(),
+            self.config.power(self.hmm.obs_dim),
+        )
+        return csr_array(alike - alike.multiply(seen > 0) > 0)
+
+    def _with_hops(self, transition: csr_array) -> csr_array:
+        """Transitions, transposed, with which a belief may change over to a node's double."""
+        alike = self.alike.sum(1).astype(np.float64)
+        share = np.where(alike > 0, HOP_PROBABILITY / np.maximum(alike, 1), 0.0)
+        stays = 1.0 - HOP_PROBABILITY * (alike > 0)
+        hopping = diags_array(stays) @ transition + diags_array(share) @ self.alike
+        return csr_array(hopping.T)
 
     # -- using ------------------------------------------------------------------------------
 
@@ -304,7 +351,8 @@ class Agent:
         action_dim = len(state["action_low"])
         self.bank = make_bank(config.controller, self.num_nodes, obs_dim, action_dim)
         self.bank.load_state_dict(_with_prefix(state, "bank."))
-        self._prepare()
+        self._prepare_recognition()
+        self._prepare_planning()
 
 
 def make_bank(kind: str, num_nodes: int, obs_dim: int, action_dim: int) -> Bank:

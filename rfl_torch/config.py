@@ -52,9 +52,14 @@ class AgentConfig:
     """"torus" joins opposite borders of the lattice."""
     start: Literal["equal", "data"] = "data"
     """"equal" is the paper's mean 0.5 and scale 0.05 for all nodes; "data" the log's own."""
+    counted_readings: float | None = 7.2
+    """How many readings an observation counts for: with D of them the emission log-densities are
+    multiplied by min(1, counted_readings / D), on top of the stages' temperatures. Rays that see
+    the same few walls are not independent, and counted in full they outvote every transition.
+    None counts all, as the paper does."""
     stages: tuple[Stage, ...] = (
-        Stage(5, 200, (0.003, 0.3), pseudo_count=0.01, min_scale=0.02, tolerance=0.0),
-        Stage(1, 60, (0.3, 0.3), pseudo_count=0.01, min_scale=0.02),
+        Stage(2, 200, (0.01, 1.0), pseudo_count=0.01, min_scale=0.02, tolerance=0.0),
+        Stage(1, 40, pseudo_count=0.01, min_scale=0.02),
     )
     """The learning procedure, from coarse time to fine."""
     controller: Literal["rbf", "mlp", "svr"] = "rbf"
@@ -71,6 +76,7 @@ class AgentConfig:
         """Every choice as the paper has it, for the maze of section 3."""
         return cls(
             start="equal",
+            counted_readings=None,
             stages=paper_stages(),
             controller="svr",
             uses_reversal=False,
@@ -82,10 +88,10 @@ class AgentConfig:
         """The paper's choices for section 4: 22 x 22 nodes and no sub-sampling."""
         return dataclasses.replace(cls.paper(), shape=(22, 22), stages=paper_stages((1,)))
 
-    @property
-    def temperature(self) -> float:
-        """Power of the emission densities in recognition: the one that learning ended with."""
-        return self.stages[-1].temperature[1]
+    def power(self, obs_dim: int) -> float:
+        """Power of the emission densities of `obs_dim` readings, in learning and recognition."""
+        counted = obs_dim if self.counted_readings is None else self.counted_readings
+        return min(1.0, counted / obs_dim)
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values."""

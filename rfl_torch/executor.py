@@ -99,8 +99,8 @@ class BeliefExecutor:
 
     A next node is kept until it or a cheaper one is recognised: choosing anew at every step, two
     neighbours that each name the other would hold the robot between them. A next node that is not
-    reached in `patience` steps puts its edge's cost up, in this executor, and the way is planned
-    anew.
+    reached in time puts its edge's cost up, for this and for later tasks of the agent, and the way
+    is planned anew.
     """
 
     def __init__(self, agent: "Agent", goals: NDArray[np.int64], seed: int) -> None:
@@ -108,7 +108,7 @@ class BeliefExecutor:
         self._goals = goals
         self.goal = int(goals[0])
         self._innate = InnateController(*agent.action_bounds, seed=seed)
-        self._cost = agent.graph.copy()
+        self._cost = agent.graph  # shared: what one task finds out, the next one knows
         self._cost_to_go = cost_to_go(self._cost, goals)
         self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
         self._next = -1
@@ -183,6 +183,9 @@ class BeliefExecutor:
             self._fail("no way is known from here")
             return
         self._from, self._next = self.node, self._cheapest_neighbor(self.node)
+        # No action leads from a node to its double: take it as done and head for what follows.
+        while self._agent.alike[self._from, self._next] and self._next not in self._goals:
+            self._from, self._next = self._next, self._cheapest_neighbor(self._next)
         self._steps_left = self._config.patience
 
     def _blame(self) -> None:

@@ -13,7 +13,7 @@ EM freezes into its first assignment; tempered, the grid unfolds before the emis
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -53,6 +53,11 @@ class Stage:
     """Keep the share tau = k / K of the old means and variances (eq. 11, formula as printed)."""
     tolerance: float = 1e-5
     """End the stage when the log-likelihood per step gains less, relatively, PATIENCE times."""
+
+    def tempered(self, power: float) -> "Stage":
+        """The same stage with both temperatures multiplied."""
+        first, last = self.temperature
+        return replace(self, temperature=(power * first, power * last))
 
     def temperature_at(self, iteration: int) -> float:
         """Temperature of iteration 0, 1, ..."""

@@ -7,11 +7,14 @@ every node to a goal, so that each control step can look its next node up.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
-UNTRIED, REVERSED = 3.0, 10.0
-"""Cost of an edge that was only ever taken the other way, in a reversible world and in another."""
+ALIKE = 1.0
+"""Nats of separation under which two nodes look alike."""
+
+UNTRIED, REVERSED = 2.5, 10.0
+"""Factors of an edge only ever taken the other way, in a reversible world and in another."""
 
 
 def threshold_graph(transition: NDArray[np.float64], epsilon: float) -> csr_array:
@@ -22,10 +25,10 @@ def threshold_graph(transition: NDArray[np.float64], epsilon: float) -> csr_arra
 
 
 def seen_edges(count: csr_array, is_reversible: bool) -> csr_array:
-    """Costs of the edges that were taken, or taken the other way round; (N, N) from counts.
+    """Cost factors of the edges that were taken, or taken the other way round; (N, N) from counts.
 
-    An edge costs 1 and the more the rarer it was taken. One that was taken in the other direction
-    only may be passable too: in a world found reversible it costs UNTRIED, else REVERSED, and is
+    An edge counts 1 and the more the rarer it was taken. One that was taken in the other direction
+    only may be passable too: in a world found reversible it counts UNTRIED, else REVERSED, and is
     tried where nothing else leads on.
     """
     taken = count.astype(np.float64).tocoo()
@@ -35,6 +38,22 @@ def seen_edges(count: csr_array, is_reversible: bool) -> csr_array:
     backward = csr_array((np.ones(len(row)), (column, row)), shape=count.shape)
     untried = backward - backward.multiply(cost > 0)
     return csr_array(cost + (UNTRIED if is_reversible else REVERSED) * untried)
+
+
+def look_alikes(mean: NDArray[np.float64], scale: NDArray[np.float64], power: float) -> csr_array:
+    """Pairs of nodes that their emissions can't tell apart, bool (N, N) without the diagonal.
+
+    A log laid out on a grid can run over one place on two sheets. The sheets' nodes look alike,
+    and a robot that is at one is at the other. So are truly different places that look the same:
+    which it is shows when the plan over such a pair works out, or doesn't.
+    """
+    rows = []
+    for node in range(len(mean)):
+        distance = (mean - mean[node]) ** 2 / (scale**2 + scale[node] ** 2)
+        is_alike = 0.5 * power * distance.sum(1) < ALIKE
+        is_alike[node] = False
+        rows.append(csr_array(is_alike[None]))
+    return csr_array(vstack(rows))
 
 
 def reachability_path(graph: csr_array, start: int, goal: int) -> list[int]:

@@ -1,0 +1,137 @@
+"""How every command starts, makes its environment, writes its files and fails."""
+
+import contextlib
+import io
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import gymnasium as gym
+import tyro
+
+Config = TypeVar("Config")
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+EXPECTED = (ValueError, OSError, ImportError, gym.error.Error)
+"""What bad input raises. Anything else is a fault of ours and keeps its traceback."""
+
+
+def run(main: Callable[[Config], None], config: type[Config], description: str | None) -> NoReturn:
+    """Read the options, call `main` with them, and end the process with an exit status."""
+    try:
+        main(_options(config, description))
+    except EXPECTED as error:
+        _fail(str(error) or type(error).__name__)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    sys.exit(0)
+
+
+def make_env(env_id: str, layout: str | None = None, kwargs: str = "{}", **more: Any) -> gym.Env:
+    """Make the environment `env_id`.
+
+    Args:
+        env_id: a registered id.
+        layout: passed on as `layout=` if not None.
+        kwargs: more arguments of the environment, a JSON object.
+        more: arguments of `gym.make`.
+
+    Raises:
+        ValueError: if there is no such environment, or it refuses its arguments.
+    """
+    try:
+        arguments = json.loads(kwargs)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--env-kwargs {kwargs!r} is no JSON ({error}).") from None
+    if not isinstance(arguments, dict):
+        raise ValueError(
+            f'--env-kwargs {kwargs!r} is no JSON object; try \'{{"layout": "loop"}}\'.'
+        )
+    if layout is not None:
+        arguments["layout"] = layout
+    _import_sims()
+    try:
+        return gym.make(env_id, disable_env_checker=True, **more, **arguments)
+    except (TypeError, ModuleNotFoundError, gym.error.Error) as error:
+        raise ValueError(f"environment {env_id!r} can't be made: {error}") from None
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder of `path`, and make sure that the file can be written before long work.
+
+    Raises:
+        OSError: if it can't.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; needs the name of a file to write.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    probe = path.with_name(f".probe-{os.getpid()}-{path.name}")
+    probe.touch()
+    probe.unlink()
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give the name of a new file that takes the place of `path` once the block is through."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f".new-{os.getpid()}-{path.name}")
+    try:
+        yield new
+        os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def check_count(name: str, value: int) -> None:
+    """Refuse a number of things below one."""
+    if value < 1:
+        raise ValueError(f"{name} is {value}; needs at least 1.")
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """Return lines of text with aligned columns: the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = []
+    for row in [header, ["-" * width for width in widths], *rows]:
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
+    return "\n".join(lines)
+
+
+def _options(config: type[Config], description: str | None) -> Config:
+    """Parse the command line; of tyro's framed complaint only the text is kept."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(config, description=description)
+    except SystemExit as end:
+        if not end.code:
+            raise
+    lines = [line.strip("│ ") for line in complaint.getvalue().splitlines()]
+    words = [line for line in lines if line and line[0] not in "╭╰─"]
+    text = " ".join(words).split(" Argument helptext:")[0].split(" For full helptext")[0]
+    _fail(f"{text}; see --help")
+
+
+def _fail(message: str) -> NoReturn:
+    print("error:", " ".join(message.split()), file=sys.stderr)
+    sys.exit(BAD_INPUT)
+
+
+def _import_sims() -> None:
+    """Register our environments; Bullet's greeting on stderr is kept from the user."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        import sims.maze
+        import sims.pendulum  # noqa: F401
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -1,0 +1,223 @@
+"""Let a trained agent go to one goal after the other, and count how often it arrives.
+
+python -m experiments.execute --model maze.safetensors --env rfl/RangefinderMaze-v0 --trials 118
+python -m experiments.execute --model maze.safetensors --log log.npz --gif way.gif
+
+"believed" counts the tasks that the agent says it has done. "true" needs to know where the goals
+are: a maze's places are known, its nodes only by the training log (--log).
+"""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+from experiments import cli, figures, scoring
+from experiments.scoring import MAZE, NodeTable, Task, Trial, World
+from rfl_torch import Agent, Trajectory
+from rfl_torch.monitor import TensorBoardMonitor
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of an execution."""
+
+    model: Path
+    """Agent that `experiments.train` wrote."""
+    env: str = "rfl/RangefinderMaze-v0"
+    """Environment to act in."""
+    trials: int = 118
+    """Tasks of each kind."""
+    limit: int | None = None
+    """Control steps of a task; left out, 800, and 1000 for the pendulum."""
+    log: tuple[Path, ...] = ()
+    """The training logs, for where the nodes are: without them no node's goal is checked."""
+    goal: int | None = None
+    """Go to this node every time, instead of to random ones."""
+    gif: Path | None = None
+    """Animation of a task to write; needs --log."""
+    logdir: Path | None = None
+    """Folder for TensorBoard's events: `execute/success_rate` after each task."""
+    layout: str | None = None
+    """The maze's layout: a built-in name, or the path of a JSON file."""
+    env_kwargs: str = "{}"
+    """More arguments of the environment, a JSON object such as '{"sensor_noise": 0.02}'."""
+    seed: int = 0
+    """Seed of the goals, the starts and the executors."""
+
+
+def main(config: Config) -> None:
+    """Run the tasks and print what came of them."""
+    _check(config)
+    agent = Agent.load(config.model)
+    logs = [Trajectory.load(path) for path in config.log]
+    with contextlib.ExitStack() as stack:
+        env, probe = (
+            stack.enter_context(cli.make_env(config.env, config.layout, config.env_kwargs))
+            for _ in range(2)
+        )
+        _check_fit(agent, env)
+        world = scoring.world_of(env)
+        truth = scoring.ground_truth(logs) if logs else None
+        if world is None and truth is not None:
+            raise ValueError(
+                f"--log tells where the nodes are, but {config.env!r} has no measure of what is "
+                "near enough; leave it out."
+            )
+        is_scored = world is not None and truth is not None
+        table = scoring.node_table(agent, logs, world) if is_scored and world else None
+        board = None
+        if config.logdir is not None:
+            config.logdir.mkdir(parents=True, exist_ok=True)
+            board = stack.enter_context(TensorBoardMonitor(config.logdir))
+        kinds = _tasks(config, agent, env, probe, table, truth)
+        rows = []
+        for name, tasks in kinds.items():
+            start = None if truth is None else truth[-1]
+            trials = run(env, agent, tasks, world, start, config.seed, name, board, config.limit)
+            rows.append(row(name, scoring.score(trials, _layout(env))))
+            if config.gif is not None and name.startswith("node") and table is not None:
+                animate(config.gif, env, agent, best_trial(trials), table)
+    print(cli.table(HEADER, rows))
+
+
+HEADER = ["goals", "believed", "true", "median steps", "median detour", "gave up"]
+
+
+def row(name: str, score: scoring.Score) -> list[str]:
+    """Return a line of the table of results."""
+    return [
+        name,
+        str(score.believed),
+        "unknown" if score.true is None else str(score.true),
+        _number(score.median_steps, ".0f"),
+        _number(score.median_detour, ".2f"),
+        str(score.gave_up),
+    ]
+
+
+def run(
+    env: gym.Env,
+    agent: Agent,
+    tasks: Sequence[Task],
+    world: World | None,
+    start: scoring.Array | None,
+    seed: int,
+    description: str,
+    board: TensorBoardMonitor | None = None,
+    limit: int | None = None,
+) -> list[Trial]:
+    """Run the tasks with a progress bar, and write the running success rate to TensorBoard."""
+    trials: list[Trial] = []
+    running = scoring.run_tasks(env, agent, tasks, world, start, seed, limit)
+    done = 0
+    for trial in (bar := tqdm(running, total=len(tasks), desc=description, unit="task")):
+        trials.append(trial)
+        done += trial.outcome.is_believed if trial.is_true is None else trial.is_true
+        bar.set_postfix(success=f"{done / len(trials):.2f}", refresh=False)
+        if board is not None:
+            board.scalar("execute/success_rate", done / len(trials), len(trials))
+    return trials
+
+
+def best_trial(trials: Sequence[Trial]) -> Trial:
+    """Return the most telling trial: the longest way that led truly, or by belief, to the goal."""
+    return max(
+        trials,
+        key=lambda trial: (
+            bool(trial.is_true),
+            trial.outcome.is_believed,
+            len(trial.outcome.planned),
+        ),
+    )
+
+
+def animate(path: Path, env: gym.Env, agent: Agent, trial: Trial, table: NodeTable) -> None:
+    """Do the task of the trial again, from the same start, and write an animation of it."""
+    frames: list[figures.Frame] = []
+    world, trace = scoring.world_of(env), trial.outcome.trace
+    assert world is not None
+    assert trace is not None
+    observation, info = env.reset(options={world.reset_option: tuple(trace[0])})
+    executor = agent.executor(trial.goal, seed=trial.seed)
+    scoring.run_task(
+        env,
+        executor,
+        observation,
+        info,
+        trial.outcome.num_steps,
+        lambda executor, info: frames.append(
+            figures.Frame(info["ground_truth"], executor.node, list(executor.path), executor.goal)
+        ),
+    )
+    with cli.replacing(path) as new:
+        if world is MAZE:
+            walls = scoring.maze_layout(env).solid_walls
+            figures.write_execution_gif(new, table.mean, frames, walls)
+        else:
+            states = np.stack([frame.position for frame in frames])
+            planned = trial.outcome.planned or [trial.goal]
+            figures.write_pendulum_gif(new, states, table.mean, planned)
+
+
+def _tasks(
+    config: Config,
+    agent: Agent,
+    env: gym.Env,
+    probe: gym.Env,
+    table: NodeTable | None,
+    truth: scoring.Array | None,
+) -> dict[str, list[Task]]:
+    rng = np.random.default_rng(config.seed)
+    world = scoring.world_of(env)
+    if config.goal is not None:
+        if not 0 <= config.goal < agent.num_nodes:
+            raise ValueError(
+                f"--goal is {config.goal}; the agent has the nodes 0 to {agent.num_nodes - 1}."
+            )
+        tasks = scoring.node_tasks(np.array([config.goal]), table, config.trials, rng)
+        if world is MAZE or truth is not None:
+            tasks = scoring.from_anywhere(tasks, env, truth, rng)
+        return {f"node {config.goal}": tasks}
+    kinds = {"nodes": scoring.node_tasks(np.arange(agent.num_nodes), table, config.trials, rng)}
+    if world is MAZE:
+        kinds["places"] = scoring.place_tasks(probe, config.trials, rng)
+    return kinds
+
+
+def _check(config: Config) -> None:
+    """Refuse what can be refused before any work."""
+    cli.check_count("--trials", config.trials)
+    if config.limit is not None:
+        cli.check_count("--limit", config.limit)
+    if config.gif is not None:
+        cli.check_writable(config.gif)
+        if not config.log:
+            raise ValueError("--gif draws where the nodes are; give the training log with --log.")
+
+
+def _check_fit(agent: Agent, env: gym.Env) -> None:
+    """Refuse an environment that the agent has not learned from."""
+    shapes = (env.observation_space.shape, env.action_space.shape)
+    needed = (agent.observation_low.shape, agent.rest_action.shape)
+    if shapes != needed:
+        raise ValueError(
+            f"the environment has observations and actions of shapes {shapes}, the agent learned "
+            f"with {needed}; give the --env of its log."
+        )
+
+
+def _layout(env: gym.Env) -> object:
+    return scoring.maze_layout(env) if scoring.world_of(env) is MAZE else None
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)
+
+
+if __name__ == "__main__":
+    cli.run(main, Config, __doc__)

@@ -1,0 +1,126 @@
+"""Learn a map and controllers from recorded logs.
+
+python -m experiments.train --log log.npz --out maze.safetensors --logdir runs/maze
+tensorboard --logdir runs
+"""
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from tqdm import tqdm
+
+from experiments import cli
+from rfl_torch import Agent, AgentConfig, GridHMM, Statistics, Trajectory
+from rfl_torch.learning import Progress
+from rfl_torch.monitor import TensorBoardMonitor
+
+CONFIGS: dict[str, Callable[[], AgentConfig]] = {
+    "default": AgentConfig,
+    "paper": AgentConfig.paper,
+    "pendulum": lambda: replace(AgentConfig(), shape=(22, 22)),
+    "paper-pendulum": AgentConfig.paper_pendulum,
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of a training."""
+
+    log: tuple[Path, ...]
+    """Logs that `experiments.record` wrote, or any npz with `observations` and `actions`."""
+    out: Path
+    """File to write the agent to."""
+    logdir: Path | None = None
+    """Folder for TensorBoard's events; left out, none are written."""
+    config: Literal["default", "paper", "pendulum", "paper-pendulum"] = "default"
+    """Choices of the method: the best that we know or the paper's, for the maze or the pendulum."""
+    seed: int = 0
+    """Seed of the start of learning."""
+
+
+def main(config: Config) -> None:
+    """Learn, save the agent and say how it went."""
+    cli.check_writable(config.out)
+    if not config.log:
+        raise ValueError("--log names no file; give one log or several.")
+    logs = [Trajectory.load(path) for path in config.log]
+    begin = time.perf_counter()
+    with contextlib.ExitStack() as stack:
+        board = None
+        if config.logdir is not None:
+            config.logdir.mkdir(parents=True, exist_ok=True)
+            board = stack.enter_context(TensorBoardMonitor(config.logdir))
+        agent = fit(CONFIGS[config.config](), logs, config.seed, board)
+    save_agent(agent, config.out)
+    print(
+        f"{config.out}: {agent.num_nodes} nodes, log-likelihood per step "
+        f"{agent.record[-1].log_likelihood_per_step:.3f}, {len(agent.record)} iterations in "
+        f"{time.perf_counter() - begin:.0f} s"
+    )
+
+
+def fit(
+    config: AgentConfig,
+    logs: list[Trajectory],
+    seed: int,
+    board: TensorBoardMonitor | None = None,
+    description: str = "train",
+) -> Agent:
+    """Return an agent that learned from the logs, with a progress bar over EM iterations."""
+    if board is not None:
+        board.config({"seed": seed, "agent": asdict(config)})
+    total = sum(stage.iterations for stage in config.stages)
+    with tqdm(total=total, desc=description, unit="it") as bar:
+        monitor = BarMonitor(bar, [stage.iterations for stage in config.stages], board)
+        return Agent(config, seed).fit(logs, monitor=monitor)
+
+
+def save_agent(agent: Agent, path: Path) -> None:
+    """Write the agent in one go, so that a crash leaves an older file whole."""
+    with cli.replacing(path) as new:
+        agent.save(new)
+
+
+class BarMonitor:
+    """Moves a progress bar, and passes everything on to TensorBoard if there is one.
+
+    Args:
+        bar: a tqdm bar over the iterations of all stages.
+        iterations: most iterations of each stage.
+        board: monitor to pass everything on to.
+    """
+
+    def __init__(self, bar: Any, iterations: list[int], board: TensorBoardMonitor | None) -> None:
+        self._bar, self._iterations, self._board = bar, iterations, board
+
+    def on_iteration(self, hmm: GridHMM, statistics: Statistics, progress: Progress) -> None:
+        """Move on by one."""
+        before = sum(self._iterations[: progress.stage])
+        self._bar.set_postfix(
+            stage=progress.stage, loglik=f"{progress.log_likelihood_per_step:.2f}", refresh=False
+        )
+        self._bar.update(before + progress.iteration + 1 - self._bar.n)
+        if self._board is not None:
+            self._board.on_iteration(hmm, statistics, progress)
+
+    def on_stage_end(self, hmm: GridHMM, stage: int) -> None:
+        """Move on to the stage's end, which it may have reached before its last iteration."""
+        self._bar.update(sum(self._iterations[: stage + 1]) - self._bar.n)
+        if stage + 1 == len(self._iterations):
+            self._bar.set_postfix_str("controllers", refresh=False)
+        self._bar.refresh()
+        if self._board is not None:
+            self._board.on_stage_end(hmm, stage)
+
+    def scalar(self, tag: str, value: float, step: int) -> None:
+        """Pass a number on."""
+        if self._board is not None:
+            self._board.scalar(tag, value, step)
+
+
+if __name__ == "__main__":
+    cli.run(main, Config, __doc__)
