@@ -40,6 +40,9 @@ Bank = MLPBank | RBFBank | SVRBank
 REVERSIBLE_SHARE = 0.5
 """A world is reversible if controllers explain this share of a backwards log's actions."""
 
+UNFAMILIAR_SHARE = 0.001
+"""An observation is unfamiliar if its density is below that of all but this share of the log."""
+
 HOP_PROBABILITY = 0.05
 """Chance a step that the belief changes over to a node that looks the same."""
 
@@ -63,6 +66,8 @@ class Agent:
     """int64 (N, K): how often the recognised log took each edge."""
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
+    least_familiar: float
+    """Tempered log-density [nat] under its node that an observation of a known place has."""
 
     def __init__(self, config: AgentConfig | None = None, seed: int = 0) -> None:
         self.config = AgentConfig() if config is None else config
@@ -135,19 +140,21 @@ class Agent:
         """
         self._prepare_recognition()
         self.edge_count = torch.zeros(self.hmm.successor.shape, dtype=torch.int64)
-        forward, backward = [], []
+        forward, backward, densities = [], [], []
         for log, sequence in zip(logs, observations, strict=True):
             path = torch.from_numpy(
                 inference.most_likely_path(self._uniform_chain, sequence.numpy())
             )
             self._count_edges(path)
+            densities.append(self._own_log_density(sequence, path))
             actions = torch.from_numpy(self._unit_actions(log.actions))
             samples = (path, sequence.float(), actions, self.config.horizon)
             forward.append(assign_triplets(*samples))
             backward.append(assign_reversed(*samples))
         loss = self._train_bank(concatenate(forward))
+        self.least_familiar = torch.cat(densities).quantile(UNFAMILIAR_SHARE).item()
         self.is_reversible = False
-        if self.config.uses_reversal:
+        if self.config.uses_reversal and len(forward[0].node):
             share = explained(self.bank, concatenate(backward))
             self.is_reversible = share > REVERSIBLE_SHARE
         if self.is_reversible:
@@ -157,12 +164,23 @@ class Agent:
         self._prepare_planning()
 
     def _train_bank(self, triplets: Triplets) -> float:
+        """Learn a new bank from triplets; where the log never changes node, it stays at rest."""
         pooled = pool_sparse_nodes(triplets, self.hmm.successor, self.hmm.successor_mask)
         torch.manual_seed(self.seed)
         self.bank = make_bank(
             self.config.controller, self.num_nodes, self.hmm.obs_dim, pooled.action.shape[1]
         )
+        if not len(pooled.node):
+            return 0.0
         return self.bank.fit(pooled.inputs, pooled.action, pooled.node)
+
+    def _own_log_density(self, observations: Tensor, path: Tensor) -> Tensor:
+        """Tempered log-density of each observation under its own node, (T,)."""
+        hmm, power = self.hmm, self.config.power(self.hmm.obs_dim)
+        with torch.no_grad():
+            own = torch.distributions.Normal(hmm.emission_mean[path], hmm.emission_scale[path])
+            log_density = own.log_prob(observations.nan_to_num(0.0))
+        return power * log_density.masked_fill(observations.isnan(), 0.0).sum(1)
 
     def _count_edges(self, path: Tensor) -> None:
         source, target = path[:-1], path[1:]
@@ -259,11 +277,21 @@ class Agent:
         """Make the object that drives to `goal`.
 
         Args:
-            goal: a node's index; an observation (D,), for any place that looks like it; or a
-                predicate on node indices, for the nearest node that fulfils it.
+            goal: a node's index; an observation (D,), for any place that looks like it (given up
+                at once if no node does); or a predicate on node indices, for the nearest node
+                that fulfils it.
             seed: of the innate actions that it falls back on.
+
+        Raises:
+            ValueError: if the goal is no kept node or no node fulfils it.
         """
-        return make_executor(self, self._goal_nodes(goal), seed)
+        executor = make_executor(self, self._goal_nodes(goal), seed)
+        if not isinstance(goal, int | np.integer) and not callable(goal):
+            log_density = self.log_emission(self.normalize(goal)).max()
+            if log_density < self.least_familiar:
+                executor.status = "gave_up"
+                executor.reason = "no node looks like the goal: the log has not been there"
+        return executor
 
     def _goal_nodes(self, goal: Goal) -> NDArray[np.int64]:
         if isinstance(goal, int | np.integer):
@@ -315,6 +343,7 @@ class Agent:
         state |= {f"bank.{name}": value for name, value in self.bank.state_dict().items()}
         state |= {
             "edge_count": self.edge_count,
+            "least_familiar": torch.tensor(self.least_familiar, dtype=torch.float64),
             "is_reversible": torch.tensor(self.is_reversible),
             "observation_low": torch.from_numpy(self.observation_low),
             "observation_scale": torch.from_numpy(self.observation_scale),
@@ -347,6 +376,7 @@ class Agent:
         self.observation_scale = state["observation_scale"].numpy()
         self.action_bounds = (state["action_low"].numpy(), state["action_high"].numpy())
         self.edge_count = state["edge_count"]
+        self.least_familiar = float(state["least_familiar"])
         self.is_reversible = bool(state["is_reversible"])
         action_dim = len(state["action_low"])
         self.bank = make_bank(config.controller, self.num_nodes, obs_dim, action_dim)

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Status = Literal["running", "reached", "gave_up"]
 
+KICK = 3
+"""Innate actions after an aborted or a null plan: enough to leave a standstill, not the map."""
+
 
 class PathExecutor:
     """The paper's procedure: recognise along the planned path, abort below a threshold, re-plan."""
@@ -75,11 +78,12 @@ class PathExecutor:
         is_lost = self.belief[self.node] < self._config.abort_probability
         if is_lost or self._stalled >= self._config.window:
             self.path, self.node = [], int(self.belief.argmax())
+            self._babble_left = KICK
         elif self.node == self.goal:
             self.status = "reached"
 
     def _plan(self) -> None:
-        """Plan anew from the likeliest node; after a null path, babble for a window's length."""
+        """Plan anew from the likeliest node."""
         self._plans += 1
         if self._plans > self._config.max_plans:
             self.status = "gave_up"
@@ -89,7 +93,7 @@ class PathExecutor:
         self.path = reachability_path(self._graph, self.node, self.goal)
         self.recovering = not self.path
         if self.recovering:
-            self._babble_left = self._config.window
+            self._babble_left = KICK
         elif self.node == self.goal:
             self.status = "reached"
 

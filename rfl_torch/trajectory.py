@@ -111,7 +111,8 @@ class Trajectory:
             if isinstance(error, FileNotFoundError):
                 raise
             raise ValueError(
-                f"{path} is not a readable npz file of plain arrays: {error}"
+                f"{path} is no npz file of plain number arrays, or a damaged one "
+                f"({type(error).__name__}); write it with Trajectory.save or numpy.savez."
             ) from None
         if missing := [name for name in _ARRAYS[:2] if name not in arrays]:
             raise ValueError(

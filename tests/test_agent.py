@@ -80,6 +80,23 @@ def test_an_observation_is_a_goal(agent):
     assert np.linalg.norm(end - target) < TOLERANCE
 
 
+def test_a_goal_that_looks_like_no_known_place_is_given_up_at_once(agent):
+    executor, _, actions = drive(agent, np.full(4, 3.0, np.float32), (0.5, 0.5))
+    assert executor.status == "gave_up"
+    assert "no node looks like the goal" in executor.reason
+    np.testing.assert_array_equal(actions, [agent.rest_action])
+
+
+def test_a_log_that_stays_at_one_node_leaves_a_robot_at_rest(log):
+    short = Trajectory(log.observations[:41], log.actions[:40])
+    config = dot_config(shape=(1, 1))
+    agent = Agent(config).fit(short)
+    executor = agent.executor(0)
+    assert agent.num_nodes == 1
+    np.testing.assert_array_equal(executor.act(log.observations[0]), agent.rest_action)
+    assert executor.status == "reached"
+
+
 def test_a_predicate_is_a_goal_and_the_nearest_node_will_do(agent, log):
     position = node_positions(agent, log)
     executor, end, _ = drive(agent, lambda node: position[node, 0] > 0.75, (0.2, 0.2))
