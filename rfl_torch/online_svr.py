@@ -24,12 +24,15 @@ Their symbols, and the paper's, are ours as follows.
                 keeps h_S still and sum theta zero
     gamma       rate of h per unit of theta_c; of the sample itself, the Schur complement of Q_SS
 
-Three situations that the article leaves open are settled here. While S is empty no theta can
+Four situations that the article leaves open are settled here. While S is empty no theta can
 move, so the bias moves alone, towards the moving sample, until some sample reaches the edge of
 its class; a solution that ends without a free theta takes the middle of the interval of optimal
 biases, as libsvm does. A repeated input would make the inverse singular, so Q carries a ridge of
 1e-9 on its diagonal, which violates the conditions by no more than 1e-9 C; repeated samples then
-share their theta. Ties go to the moving sample, then to the lowest index, against cycles.
+share their theta. Ties go to the moving sample, then to the lowest index, against cycles. On
+inputs that nearly repeat each other, with targets that contradict, rounding can make the path
+cycle all the same: a path of more events than samples is given up, and the batch problem is
+solved from there by an active-set method in which every step lowers the objective.
 """
 
 import math
@@ -47,9 +50,11 @@ SUPPORT, ERROR, REMAINING, MOVING = range(4)
 
 INITIAL_BIAS = 0.5  # the stop action, when actions are scaled to [0, 1]
 RIDGE = 1e-9  # added to Q_ii = 1, or a repeated input would make the inverse singular
-STILL = 1e-13  # rates below this are rounding: a sample far from the others does not move at all
+STILL = 1e-13  # rates below this times max(1, |theta rates|_1) are rounding, not motion
 TIE = 1e-12  # steps closer than this happen together
-KKT_TOLERANCE = 1e-7  # times max(1, cost), in units of the target; rounding leaves 1e-13
+SOLVER_TOLERANCE = 1e-11  # times max(1, cost), in units of the target: a violation left as it is
+STEPS_PER_SAMPLE = 20  # of one refit; usually two are enough
+KKT_TOLERANCE = 1e-10  # times max(1, cost), in units of the target; rounding leaves 1e-13
 PADDING = 8  # the bank's sample axis grows by this many rows, so that few steps reallocate it
 MAX_GATHERED = 2**24  # numbers (128 MiB) that one piece of a forward pass may gather
 
@@ -98,6 +103,7 @@ class OnlineSVR:
         self._inputs = np.zeros((0, 0))
         self._targets = np.zeros(0)
         self._support: list[int] = []  # S in the order of the rows of the inverse
+        self.num_events = 0  # pieces of paths and steps of refits so far, a measure of the work
         self._forget_solution()
 
     def resume(
@@ -116,10 +122,7 @@ class OnlineSVR:
         self._forget_solution()
         self._theta[:] = dual_coef
         self._bias = float(bias)
-        for i, theta in enumerate(self._theta):
-            group = REMAINING if theta == 0 else ERROR if abs(theta) >= self.cost else SUPPORT
-            self._place(i, group, np.sign(theta))
-        self._support = self.support_set.tolist()
+        self._classify()
         self._refactor()
         self._verify()
 
@@ -244,8 +247,8 @@ class OnlineSVR:
                 self._theta[c] = 0.0
 
     def _patience(self) -> range:
-        """Bound the events of one path, usually about |S|; `_verify` starts over beyond it."""
-        return range(20 * (len(self) + 10))
+        """Bound the events of one path, usually fewer than |S|; beyond it `_verify` refits."""
+        return range(len(self) + 10)
 
     def _rates(self, c: int, q: float) -> _Rates:
         """Return how everything changes as theta_c moves in direction `q` (+1 or -1)."""
@@ -259,13 +262,14 @@ class OnlineSVR:
 
     def _step(self, rates: _Rates, own_step: float) -> bool:
         """Move to the next event; True if that is the moving sample's own, `own_step` away."""
+        self.num_events += 1
         in_support = self._group == SUPPORT
         position = np.where(in_support, self._theta, self._residual)
         velocity = np.where(in_support, rates.theta, rates.residual)
         room = np.where(velocity > 0, self._high - position, position - self._low)
         speed = np.abs(velocity)
         step = np.full(len(self), np.inf)
-        moves = speed > STILL
+        moves = speed > STILL * max(1.0, np.abs(rates.theta).sum())
         step[moves] = np.maximum(room[moves], 0) / speed[moves]
         shortest = step.min()
         tie = TIE * (1 + shortest)
@@ -340,12 +344,11 @@ class OnlineSVR:
         self._inverse = self._inverse[np.ix_(keep, keep)] - outer
         del self._support[k - 1]
 
-    def _forget_solution(self, ridge: float = RIDGE) -> None:
+    def _forget_solution(self) -> None:
         n = len(self._targets)
-        self._ridge = ridge
         self._theta = np.zeros(n)
         self._bias = self.initial_bias
-        self._kernel = self._kernel_to(self._inputs) + ridge * np.eye(n)
+        self._kernel = self._kernel_to(self._inputs) + RIDGE * np.eye(n)
         self._residual = self._bias - self._targets
         self._group = np.full(n, MOVING, np.int8)
         self._low, self._high = np.full(n, -np.inf), np.full(n, np.inf)
@@ -373,7 +376,7 @@ class OnlineSVR:
         self._inputs = np.concatenate((self._inputs.reshape(n, -1 if n else len(x)), x[None]))
         self._targets = np.append(self._targets, y)
         row = self._kernel_to(x[None])[0]
-        row[n] += self._ridge
+        row[n] += RIDGE
         kernel = np.empty((n + 1, n + 1))
         kernel[:n, :n], kernel[n], kernel[:, n] = self._kernel, row, row
         self._kernel = kernel
@@ -394,11 +397,11 @@ class OnlineSVR:
         return self._kernel @ self._theta + self._bias - self._targets
 
     def _verify(self) -> None:
-        """Remove the rounding of the last path; start over if the solution does not hold.
+        """Remove the rounding of the last path; refit if the solution does not hold.
 
         The residuals are recomputed, which costs as much as one step of the path. Beyond the
-        tolerance the inverse is factored anew, and if that is not enough all samples are learned
-        again from zero.
+        tolerance the inverse is factored anew, and if that is not enough the batch problem is
+        solved from the present theta.
         """
         self._polish()
         if not self._holds():
@@ -419,9 +422,7 @@ class OnlineSVR:
             self._residual = self._fresh_residual()
             members = np.array(self._support)
             low, high = self._low[members], self._high[members]
-            edge = np.where(high > 0, -self.tube, self.tube)
-            error = np.append(self._theta.sum(), self._residual[members] - edge)
-            change = -self._inverse @ error
+            change = -self._inverse @ self._support_error()
             theta = self._theta[members] + change[1:]
             at_bound = np.minimum(theta - low, high - theta) <= TIE * self.cost
             for k in np.flatnonzero(at_bound):
@@ -433,9 +434,18 @@ class OnlineSVR:
                 break
         self._residual = self._fresh_residual()
         if len(self) and not self._support and (self._group != MOVING).all():
-            below, above = np.max(self._low - self._residual), np.min(self._high - self._residual)
-            self._bias += (below + above) / 2
-            self._residual += (below + above) / 2
+            self._centre_bias()
+
+    def _centre_bias(self) -> None:
+        """Take the middle of the interval of optimal biases, or of the gap if there is none."""
+        below, above = np.max(self._low - self._residual), np.min(self._high - self._residual)
+        self._bias += (below + above) / 2
+        self._residual += (below + above) / 2
+
+    def _support_error(self) -> Vector:
+        """Return sum theta and how far h_S is from the tube's edge, (1 + |S|,)."""
+        edge = np.where(self._high[self._support] > 0, -self.tube, self.tube)
+        return np.append(self._theta.sum(), self._residual[self._support] - edge)
 
     def _violation(self) -> float:
         """Return the largest distance of a sample from the conditions of its class."""
@@ -454,19 +464,84 @@ class OnlineSVR:
         self._inverse = np.linalg.inv(self._bordered()) if self._support else np.zeros((1, 1))
 
     def _refit(self) -> None:
-        """Forget the solution and learn every sample again, in order.
+        """Solve the batch problem by a primal active-set method, from where theta stands.
 
-        Only samples that almost repeat each other need this; should rounding mislead the path
-        once more, a larger ridge keeps them apart.
+        Every step lowers the objective: theta_S goes to its optimum given the rest, or as far as
+        the first member that reaches its bound, which leaves S; from an optimum, the sample that
+        violates its conditions most enters. Rounding cannot mislead it as it misleads the path,
+        for no direction is followed that does not pay more than rounding.
         """
-        for factor in (1, 10, 100, 1000):
-            self._forget_solution(factor * RIDGE)
-            for c in range(len(self)):
-                self._advance(c)
-                self._refactor()
-                self._polish()
-            if self._holds():
+        self._balance()
+        self._classify()
+        tolerance = SOLVER_TOLERANCE * max(1.0, self.cost)
+        for _ in range(STEPS_PER_SAMPLE * (len(self) + 10)):
+            self.num_events += 1
+            if self._descend():
+                continue
+            outside = np.maximum(self._low - self._residual, self._residual - self._high)
+            outside[self._support] = -np.inf
+            if outside.max() <= tolerance:
+                break
+            if self._support:
+                worst = [int(outside.argmax())]
+            else:  # the bias is centred: theta moves from the one end to the other
+                below, above = self._low - self._residual, self._residual - self._high
+                worst = [int(below.argmax()), int(above.argmax())]
+            for i in worst:
+                side = 1.0 if self._residual[i] < self._low[i] else -1.0
+                side = np.sign(self._theta[i]) or side
+                self._place(i, SUPPORT, side)
+                self._support.append(i)
+        self._refactor()
+        self._polish()
+
+    def _descend(self) -> bool:
+        """Move theta_S towards its optimum given the rest; True if a bound came first."""
+        self._residual = self._fresh_residual()
+        if not self._support:
+            self._centre_bias()
+            return False
+        members = np.array(self._support)
+        theta, low, high = self._theta[members], self._low[members], self._high[members]
+        change = -np.linalg.solve(self._bordered(), self._support_error())
+        step = change[1:]
+        room = np.where(step > 0, high - theta, low - theta)
+        blocked = (step != 0) & (np.abs(step) >= np.abs(room))
+        if not blocked.any():
+            self._theta[members] += step
+            self._bias += change[0]
+            self._residual = self._fresh_residual()
+            return False
+        fraction = np.full(len(members), np.inf)
+        fraction[blocked] = room[blocked] / step[blocked]
+        k = int(fraction.argmin())
+        self._theta[members] = np.clip(theta + fraction[k] * step, low, high)
+        self._bias += fraction[k] * change[0]
+        bound = high[k] if step[k] > 0 else low[k]
+        self._theta[members[k]] = bound
+        self._place(members[k], ERROR if bound else REMAINING, np.sign(bound))
+        del self._support[k]
+        return True
+
+    def _balance(self) -> None:
+        """Make theta feasible: inside its bounds, and of sum zero."""
+        self._theta = np.clip(self._theta, -self.cost, self.cost)
+        excess = self._theta.sum()
+        size = np.abs(self._theta)
+        free = (size > 0) & (size < self.cost)
+        for i in np.argsort(~free, kind="stable"):
+            if abs(excess) <= TIE * self.cost:
                 return
+            theta = np.clip(self._theta[i] - excess, -self.cost, self.cost)
+            excess += theta - self._theta[i]
+            self._theta[i] = theta
+
+    def _classify(self) -> None:
+        """Put every sample in the class of its theta; the inverse is not touched."""
+        for i, theta in enumerate(self._theta):
+            group = REMAINING if theta == 0 else ERROR if abs(theta) >= self.cost else SUPPORT
+            self._place(i, group, np.sign(theta))
+        self._support = self.support_set.tolist()
 
 
 class SVRBank(nn.Module):

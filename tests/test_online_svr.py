@@ -16,6 +16,7 @@ from rfl_torch.online_svr import OnlineSVR, SVRBank
 ORACLE_ATOL = 1e-6  # libsvm keeps the kernel in single precision, whatever its `tol`
 KKT_ATOL = 2e-9  # times max(1, cost): twice the ridge
 DEGENERATE_ATOL = 2e-8  # times max(1, cost): repeated samples may need ten times the ridge
+COLLINEAR_ATOL = 1e-5  # as above, times the theta of many samples that cancel
 EXACT_ATOL = 1e-10  # two orders of the same arithmetic
 
 
@@ -147,6 +148,48 @@ def test_repeated_inputs_and_ties_stay_optimal(samples, removals, bandwidth, cos
         x, y = np.delete(x, index, axis=0), np.delete(y, index)
         if len(x):
             assert violation(svr, x, y, **options) < limit
+
+
+def collinear_data(seed, n):
+    """One node of a pendulum held by a torque: successive angles and a motor of three levels."""
+    generator = np.random.default_rng(seed)
+    angle = 0.13 + 0.04 * generator.standard_normal(n)
+    following = angle - 0.04 + 0.003 * generator.standard_normal(n)
+    return np.stack((angle, following), axis=1), generator.choice([0, 0.5, 1], n, p=[0.8, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("seed", [0, 2])  # rounding misleads the path in both
+def test_collinear_inputs_with_unlearnable_targets_need_few_events(seed, monkeypatch):
+    options = {"bandwidth": 0.5, "cost": 10.0, "tube": 0.02}
+    x, y = collinear_data(seed, 120)
+    refit, refits = OnlineSVR._refit, []
+    monkeypatch.setattr(OnlineSVR, "_refit", lambda svr: (refits.append(len(svr)), refit(svr)))
+    svr = OnlineSVR(**options)
+    for i in range(len(x)):
+        before = svr.num_events
+        svr.add(x[i], y[i])
+        assert svr.num_events - before <= 4 * (i + 10)
+        assert svr.kkt_residual() < KKT_ATOL * options["cost"]
+    assert svr.num_events <= 40 * len(x)
+    assert len(refits) <= len(x) // 4
+    oracle = batch_svr(x, y, **options)
+    np.testing.assert_allclose(svr.predict(x), oracle.predict(x), atol=COLLINEAR_ATOL)
+    whole = OnlineSVR(**options)
+    whole.resume(x, y, np.zeros(len(x)), 0.5)  # solved as a batch
+    np.testing.assert_allclose(svr.predict(x), whole.predict(x), atol=KKT_ATOL * options["cost"])
+
+
+def test_a_path_that_cycles_is_finished_by_the_batch_solver(monkeypatch):
+    options = {"bandwidth": 0.5, "cost": 10.0, "tube": 0.02}
+    x, y = collinear_data(2, 40)
+    expected = online(x, y, **options)
+    monkeypatch.setattr(OnlineSVR, "_patience", lambda svr: range(1))
+    svr = online(x, y, **options)
+    for _ in range(10):
+        expected.remove(0)
+        svr.remove(0)
+    assert violation(svr, x[10:], y[10:], **options) < KKT_ATOL * options["cost"]
+    np.testing.assert_allclose(svr.predict(x), expected.predict(x), atol=KKT_ATOL * 10)
 
 
 def test_contradicting_targets_at_one_input_give_their_middle():
