@@ -192,6 +192,7 @@ class Agent:
         self.chain = self.hmm.chain(self.config.power(self.hmm.obs_dim))
         uniform = np.where(self.chain.is_node, -np.log(self.num_nodes), -np.inf)
         self._uniform_chain = self.chain._replace(initial_log=uniform)
+        self._mean = self.hmm.emission_mean.detach().numpy()
 
     def _prepare_planning(self) -> None:
         """Lay out the graph that is planned over, and the transitions of the belief."""
@@ -203,6 +204,7 @@ class Agent:
         seen = seen_edges(count, self.is_reversible)
         self.alike = self._look_alikes(seen)
         self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)
+        self.map_cost = self.graph.data.copy()  # executors raise the graph's where they fail
         self.transition_in = self._with_hops(csr_array((prob, (rows, target)), shape=shape))
 
     def _steps_between(self, edges: csr_array) -> csr_array:
@@ -317,10 +319,12 @@ class Agent:
 
     def control(self, normal: NDArray[np.float64], node: int) -> NDArray[np.float32]:
         """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,)."""
-        mean = self.hmm.emission_mean.detach().numpy()[node]
+        mean = self._mean[node]
         observation = np.where(np.isnan(normal), mean, normal)
-        inputs = torch.from_numpy(np.concatenate([observation, mean])[None]).float()
-        with torch.no_grad():
+        inputs = torch.from_numpy(
+            np.concatenate([observation, mean], dtype=np.float32, casting="same_kind")[None]
+        )
+        with torch.inference_mode():
             unit = self.bank(inputs, torch.tensor([node]))[0].numpy()
         return self._raw_action(unit)
 

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Status = Literal["running", "reached", "gave_up"]
 
+BLAME_LIMIT = 100.0
+"""An edge costs at most so many times what the map says: costs must still add up in float64."""
+
 KICK = 3
 """Innate actions after an aborted or a null plan: enough to leave a standstill, not the map."""
 
@@ -175,6 +178,8 @@ class BeliefExecutor:
             return
         if self._distance[self.node] < self._best:
             self._best, self._failures = self._distance[self.node], 0
+        if self._next == self.node:
+            self._scale_edge(1 / self._config.blame)
         is_pursued = self._next >= 0 and self._next != self.node
         if is_pursued and self._cost_to_go[self.node] > self._cost_to_go[self._next]:
             self._steps_left -= 1
@@ -194,11 +199,18 @@ class BeliefExecutor:
 
     def _blame(self) -> None:
         """Raise the cost of the edge that led nowhere, plan anew, count the failure."""
-        row = slice(self._cost.indptr[self._from], self._cost.indptr[self._from + 1])
-        is_edge = self._cost.indices[row] == self._next
-        self._cost.data[row][is_edge] *= self._config.blame
-        self._cost_to_go = cost_to_go(self._cost, self._goals)
+        self._scale_edge(self._config.blame)
         self._fail("no closer to the goal")
+
+    def _scale_edge(self, factor: float) -> None:
+        """Multiply the cost of the pursued edge, between the map's own and BLAME_LIMIT times it."""
+        row = slice(self._cost.indptr[self._from], self._cost.indptr[self._from + 1])
+        edge = row.start + int((self._cost.indices[row] == self._next).argmax())
+        base = self._agent.map_cost[edge]
+        cost = np.clip(self._cost.data[edge] * factor, base, BLAME_LIMIT * base)
+        if cost != self._cost.data[edge]:
+            self._cost.data[edge] = cost
+            self._cost_to_go = cost_to_go(self._cost, self._goals)
 
     def _fail(self, reason: str) -> None:
         """Count a failure; the more in a row, the longer the innate actions take over."""

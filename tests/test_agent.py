@@ -279,3 +279,21 @@ def test_logs_that_cannot_be_learned_from_are_refused(log):
         Agent(dot_config()).fit([log, Trajectory(log.observations[:, :3], log.actions)])
     with pytest.raises(ValueError, match="no log"):
         Agent(dot_config()).fit([])
+
+
+def test_blame_is_bounded_and_success_takes_it_back(agent):
+    blamed = Agent(agent.config)
+    blamed.__dict__ |= {key: value for key, value in agent.__dict__.items() if key != "config"}
+    blamed.graph = agent.graph.copy()
+    blamed.map_cost = agent.graph.data.copy()
+    still = DotWorld().reset()[0]
+    for _ in range(40):  # the robot doesn't move, whatever it is told
+        executor = blamed.executor(0)
+        for _ in range(400):
+            executor.act(still)
+    ratio = blamed.graph.data / blamed.map_cost
+    assert 1.0 < ratio.max() <= 100.0 + 1e-9
+    raised = int((ratio > 1).sum())
+    for goal in range(blamed.num_nodes):
+        drive(blamed, goal, (0.5, 0.5))
+    assert (blamed.graph.data > blamed.map_cost).sum() < raised
