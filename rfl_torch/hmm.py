@@ -10,6 +10,7 @@ Parameters are float64: a long log's likelihood and a sharp Gaussian's density n
 work is done by `inference`, whatever the parameters' type.
 """
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -62,6 +63,21 @@ class Statistics:
         """Count every step `factor` times: below 1 it forgets."""
         names = [field.name for field in fields(self)]
         return Statistics(**{name: getattr(self, name) * factor for name in names})
+
+    def to_vector(self) -> Tensor:
+        """All numbers in one vector, to be summed over processes."""
+        tensors = [torch.as_tensor(getattr(self, field.name)) for field in fields(self)]
+        return torch.cat([tensor.double().flatten() for tensor in tensors])
+
+    def from_vector(self, vector: Tensor) -> "Statistics":
+        """Statistics of this one's shapes, from a `to_vector`."""
+        names = [field.name for field in fields(self)]
+        shapes = [torch.as_tensor(getattr(self, name)).shape for name in names]
+        parts = vector.split([shape.numel() for shape in shapes])
+        values: dict[str, Any] = {
+            name: part.view(shape) for name, part, shape in zip(names, parts, shapes, strict=True)
+        }
+        return Statistics(**values | {"num_steps": values["num_steps"].item()})
 
 
 class Sample(NamedTuple):
@@ -224,6 +240,9 @@ class GridHMM(nn.Module):
             trace: tau of eq. 11, the share of the old means and variances that is kept.
             fixed: names of parameters to leave alone.
         """
+        unknown = fixed - {name for name, _ in self.named_parameters()}
+        if unknown:
+            raise ValueError(f"`fixed` names {sorted(unknown)}, which the model does not have.")
         if "initial_logits" not in fixed:
             prob = statistics.initial / statistics.initial.sum()
             self.initial_logits.copy_(prob.log().clamp(min=MIN_LOG_PROB))
@@ -250,9 +269,24 @@ class GridHMM(nn.Module):
         """Natural log of the observations' density, () [nat], summed over steps and sequences."""
         chain = self.chain()
         parts = [
-            inference.filter_rows(chain, sequence)[1] for sequence in self._sequences(observations)
+            inference.log_likelihood(chain, sequence) for sequence in self._sequences(observations)
         ]
         return torch.tensor(sum(parts), dtype=torch.float64)
+
+    def num_free_parameters(self) -> int:
+        """Numbers that EM chooses: edges and starts that sum to one, means and scales."""
+        num_edges = int(self.successor_mask.sum())
+        return (num_edges - self.num_nodes) + (self.num_nodes - 1) + 2 * self.emission_mean.numel()
+
+    def aic(self, observations: Sequences) -> float:
+        """Akaike's criterion, 2 k - 2 log L; the smaller the better."""
+        return 2 * self.num_free_parameters() - 2 * self.log_likelihood(observations).item()
+
+    def bic(self, observations: Sequences) -> float:
+        """Bayesian criterion, k log T - 2 log L over all T steps; the smaller the better."""
+        num_steps = sum(len(sequence) for sequence in self._sequences(observations))
+        penalty = self.num_free_parameters() * math.log(num_steps)
+        return penalty - 2 * self.log_likelihood(observations).item()
 
     def filter(self, observations: Tensor | np.ndarray) -> Tensor:
         """p(node at t | observations up to t), float32 (T, N)."""
@@ -294,15 +328,16 @@ class GridHMM(nn.Module):
         flow = belief.to(transition_prob.dtype)[:, None] * transition_prob
         return torch.zeros_like(flow[:, 0]).index_add(0, self.successor.flatten(), flow.flatten())
 
-    @torch.no_grad()
     def update(self, belief: Tensor, observation: Tensor | np.ndarray) -> Tensor:
-        """One control step of the filter: p(node | ..., observation), (N,), from the belief."""
-        sequence = self._sequence(observation[None])
-        log_rows = inference.log_emission(self.chain(), sequence)[:, self.cell.numpy()]
-        # What float64 has flushed to zero stays possible: a teleport may need it.
-        belief = belief.double().clamp(min=1e-300)
-        predicted = self._push(belief, self.log_transition().exp())
-        return (predicted.log() + torch.from_numpy(log_rows[0])).softmax(0)
+        """One control step of the filter: p(node | ..., observation), (N,), from the belief.
+
+        Lays the parameters out anew each time; a control loop makes `chain()` once and calls
+        `inference.filter_step`.
+        """
+        chain = self.chain()
+        state = inference.start_filter(chain, belief.detach().double().numpy())
+        prob, _ = inference.filter_step(chain, state, self._sequence(observation[None])[0])
+        return torch.from_numpy(prob).double()
 
     @torch.no_grad()
     def sample(self, num_steps: int, generator: torch.Generator) -> Sample:
@@ -376,9 +411,8 @@ class GridHMM(nn.Module):
                 f"observations have shape {array.shape}, need (T, {self.obs_dim}) with T >= 1; "
                 "give one row a step."
             )
-        is_wild = np.abs(array) > MAX_READING
-        if is_wild.any():
-            t, d = np.argwhere(is_wild)[0]
+        if np.fmax.reduce(array, None) > MAX_READING or np.fmin.reduce(array, None) < -MAX_READING:
+            t, d = np.argwhere(np.abs(array) > MAX_READING)[0]
             raise ValueError(
                 f"observation {t}, reading {d} is {array[t, d]:g}, needs a finite number under "
                 f"{MAX_READING:g}; check its units, or mark a missing reading with NaN."

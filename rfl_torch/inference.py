@@ -10,21 +10,33 @@ Symbols as in `kernels`; equation numbers are the paper's.
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rfl_torch import kernels
+from rfl_torch.simd import LANES, aligned_empty, aligned_full
 
-BLOCK = 8192
-"""Steps whose messages are held at once by each of the two threads."""
+BLOCK = 32768
+"""Steps whose messages are held at once by each of the two threads, 16 bytes a node; of longer
+halves all but the last block are run twice, which takes half as long again."""
 
 _CACHE_BLOCK = 512
+"""Steps that pass from one kernel to the next while they are in the cache."""
+
+_MAX_ENTRIES = 1 << 24
+"""Steps times cells that a block holds at most, whatever BLOCK says; an entry takes 16 bytes."""
+
+_MAX_SPARE = 1 << 28
+"""Bytes of one working buffer that are kept for the next call: fresh pages cost a tenth of it."""
 
 _UNREACHABLE = (
     "an observation lies more than 1.8e8 nats from every node that can be reached; check its "
     "units, or mark the reading as missing with NaN."
 )
+
+_spare: list[np.ndarray] = []
 
 
 class Chain(NamedTuple):
@@ -34,8 +46,10 @@ class Chain(NamedTuple):
         leaves cell c to (c + shift_out[o]) mod G.
     weight_in, weight_out: float32 mantissas (O, G), 0 where there is no edge; `*_exponent` int32.
     inverse_scale, scaled_mean, log_norm: float64 (D, G).
-    initial_log: float64 (G,) [nat], -inf in cells without a node.
+    initial_log, log_node: float64 (G,) [nat], -inf in cells without a node; log_node else 0.
+    log_weight_in: float64 (O, G) [nat], -inf where there is no edge.
     cell: int64 (N,), the cell of each node. is_node: bool (G,).
+    num_cells: G, the lattice's cells and some empty ones to fill the last tile of the kernels.
     """
 
     shift_in: np.ndarray
@@ -48,6 +62,8 @@ class Chain(NamedTuple):
     scaled_mean: np.ndarray
     log_norm: np.ndarray
     initial_log: np.ndarray
+    log_node: np.ndarray
+    log_weight_in: np.ndarray
     cell: np.ndarray
     is_node: np.ndarray
     num_cells: int
@@ -73,11 +89,16 @@ def build_diagonals(
     successor: np.ndarray, mask: np.ndarray, cell: np.ndarray, num_cells: int
 ) -> Diagonals:
     """Sort the edges of a successor table (N, K) by the shift between their cells."""
+    num_cells = _whole_tiles(num_cells)
     edge = np.argwhere(mask)
     source = cell[edge[:, 0]]
     target = cell[successor[edge[:, 0], edge[:, 1]]]
     shift, diagonal = np.unique((target - source) % num_cells, return_inverse=True)
     return Diagonals(shift, edge, diagonal, source, target)
+
+
+def _whole_tiles(num_cells: int) -> int:
+    return -(-num_cells // LANES) * LANES
 
 
 def build_chain(
@@ -91,18 +112,24 @@ def build_chain(
     temperature: float = 1.0,
 ) -> Chain:
     """Lay the parameters of N nodes out over the lattice; log_transition (N, K), mean (N, D)."""
+    num_cells = _whole_tiles(num_cells)
     shape = (len(diagonals.shift), num_cells)
-    log2_weight = log_transition[diagonals.edge[:, 0], diagonals.edge[:, 1]] / np.log(2.0)
+    log_weight = log_transition[diagonals.edge[:, 0], diagonals.edge[:, 1]]
+    log_weight_in = aligned_full(shape, -np.inf, np.float64)
+    log_weight_in[diagonals.diagonal, diagonals.target] = log_weight
+    log2_weight = log_weight / np.log(2.0)
     exponent = np.floor(log2_weight)
     mantissa = np.exp2(log2_weight - exponent).astype(np.float32)
     tables = []
     for column in (diagonals.target, diagonals.source):
-        weight = np.zeros(shape, np.float32)
-        weight_exponent = np.full(shape, kernels.ABSENT, np.int32)
+        weight = aligned_full(shape, 0.0, np.float32)
+        weight_exponent = aligned_full(shape, kernels.ABSENT, np.int32)
         weight[diagonals.diagonal, column] = mantissa
         weight_exponent[diagonals.diagonal, column] = exponent
         tables += [weight, weight_exponent]
-    inverse_scale, scaled_mean, log_norm = (np.zeros((mean.shape[1], num_cells)) for _ in range(3))
+    inverse_scale, scaled_mean, log_norm = (
+        aligned_full((mean.shape[1], num_cells), 0.0, np.float64) for _ in range(3)
+    )
     inverse_scale[:, cell] = (1.0 / scale).T
     scaled_mean[:, cell] = (mean / scale).T
     log_norm[:, cell] = (-0.5 * np.log(2 * np.pi) - np.log(scale)).T
@@ -113,48 +140,55 @@ def build_chain(
     return Chain(
         (num_cells - diagonals.shift) % num_cells, tables[0], tables[1],
         diagonals.shift, tables[2], tables[3],
-        inverse_scale, scaled_mean, log_norm, initial, cell, is_node,
+        inverse_scale, scaled_mean, log_norm,
+        initial, np.where(is_node, 0.0, -np.inf), log_weight_in, cell, is_node,
         num_cells, temperature,
     )  # fmt: skip
-
-
-class Emission(NamedTuple):
-    """b_j(o_t) over a block: mantissa and exponent (T, G), relative to `base` (T,) [nat]."""
-
-    mantissa: np.ndarray
-    exponent: np.ndarray
-    base: np.ndarray
 
 
 def log_emission(chain: Chain, observations: np.ndarray) -> np.ndarray:
     """Evaluate log b_j(o_t) * temperature over the lattice, float64 (T, G); -inf in empty cells."""
     out = np.empty((len(observations), chain.num_cells))
-    kernels.emission_rows(
-        observations, chain.inverse_scale, chain.scaled_mean, chain.log_norm,
-        chain.temperature, out,
-    )  # fmt: skip
-    if len(chain.cell) < chain.num_cells:
-        out[:, ~chain.is_node] = -np.inf
+    kernels.log_emission_rows(observations, *_gaussians(chain), out)
     return out
 
 
-def emission(chain: Chain, observations: np.ndarray) -> Emission:
-    """Evaluate the Gaussians (eq. 1) over a block of observations."""
-    shape = (len(observations), chain.num_cells)
-    result = Emission(np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape[0]))
-    for block in _blocks(slice(0, len(observations)), _CACHE_BLOCK):
-        log_rows = log_emission(chain, observations[block])
-        kernels.split_rows(log_rows, *(field[block] for field in result))
-    return result
+def _gaussians(chain: Chain) -> tuple[Any, ...]:
+    """What the emission kernels ask of a chain."""
+    return (
+        chain.inverse_scale, chain.scaled_mean, chain.log_norm, chain.log_node, chain.temperature
+    )  # fmt: skip
 
 
 class Rows(NamedTuple):
-    """A message and the emissions over one block, in time order; `log_base` [nat] of both."""
+    """A message and the emissions b_j(o_t) over some steps, in time order, all (T, G)."""
 
     mantissa: np.ndarray
     exponent: np.ndarray
-    emission: Emission
-    log_base: float
+    b: np.ndarray
+    b_exponent: np.ndarray
+
+    def part(self, steps: slice) -> "Rows":
+        """The rows of some of the steps."""
+        return Rows(*(array[steps] for array in self))
+
+
+@contextmanager
+def _borrow_rows(num_steps: int, num_cells: int) -> Iterator[Rows]:
+    """Uninitialised rows, in a buffer left over from an earlier call if there is one."""
+    size = num_steps * num_cells
+    buffer = np.empty(0, np.int32)
+    with suppress(IndexError):
+        buffer = _spare.pop()
+    if buffer.size < 4 * size:
+        buffer = aligned_empty((4 * size,), np.int32)
+    arrays = (buffer[k * size : (k + 1) * size].reshape(num_steps, num_cells) for k in range(4))
+    mantissa, exponent, b, b_exponent = arrays
+    try:
+        yield Rows(mantissa.view(np.float32), exponent, b.view(np.float32), b_exponent)
+    finally:
+        if len(_spare) < 2 and buffer.nbytes <= _MAX_SPARE:
+            _spare.append(buffer)
 
 
 class _Message:
@@ -167,78 +201,86 @@ class _Message:
         self.chain = chain
         self.observations = observations
         self.is_forward = is_forward
-        self.order = slice(None) if is_forward else slice(None, None, -1)
         self.edges = (
             (chain.shift_in, chain.weight_in, chain.weight_in_exponent)
             if is_forward
             else (chain.shift_out, chain.weight_out, chain.weight_out_exponent)
         )
         self.last = (
-            np.zeros(2 * chain.num_cells, np.float32),
-            np.zeros(2 * chain.num_cells, np.int32),
+            aligned_full((2 * chain.num_cells,), 0.0, np.float32),
+            aligned_full((2 * chain.num_cells,), 0, np.int32),
         )
 
-    def advance(self, block: slice) -> Rows:
-        """Run the message through one block, from where it stands."""
-        b = emission(self.chain, self.observations[block])
-        mantissa, exponent = np.empty_like(b.mantissa), np.empty_like(b.exponent)
-        base = np.zeros(len(mantissa))
-        rows = [array[self.order] for array in (b.mantissa, b.exponent, mantissa, exponent, base)]
-        edge_step = 0 if self.is_forward else len(self.observations) - 1
-        log_start = 0.0
-        if block.start <= edge_step < block.stop:
-            log_start = self._begin(*(row[0] for row in rows[:4]))
-            rows = [row[1:] for row in rows]
-        done = kernels.message_rows(*self.last, *rows[:2], *self.edges, *rows[2:])
+    def parts(self, block: slice) -> Iterator[tuple[slice, slice]]:
+        """Cut a block to fit the cache, in the message's order: steps, and steps in the block."""
+        for steps in _blocks(block, _CACHE_BLOCK, from_end=not self.is_forward):
+            yield steps, slice(steps.start - block.start, steps.stop - block.start)
+
+    def advance(self, block: slice, rows: Rows) -> float:
+        """Run the message through one block, from where it stands; returns the log base [nat]."""
+        return sum(self._advance(steps, rows.part(own)) for steps, own in self.parts(block))
+
+    def _advance(self, steps: slice, rows: Rows) -> float:
+        base, log_base = np.empty(len(rows.b)), 0.0
+        observations = self.observations[steps]
+        kernels.emission_rows(observations, *_gaussians(self.chain), rows.b, rows.b_exponent, base)
+        log_base = base.sum()
+        if self.is_forward and steps.start == 0:
+            log_base += self._begin(rows.part(slice(0, 1)))
+            rows = rows.part(slice(1, None))
+        elif not self.is_forward and steps.stop == len(self.observations):
+            log_base += self._begin(rows.part(slice(-1, None)))
+            rows = rows.part(slice(0, -1))
+        base = np.empty(len(rows.b), np.int64)
+        done = kernels.message_rows(
+            *self.last, rows.b, rows.b_exponent, *self.edges,
+            rows.mantissa, rows.exponent, base, not self.is_forward,
+        )  # fmt: skip
         if not done:
             raise ValueError(_UNREACHABLE)
-        return Rows(mantissa, exponent, b, base.sum() * np.log(2.0) + b.base.sum() + log_start)
+        return float(log_base + base.sum() * np.log(2.0))
 
-    def _begin(self, b: np.ndarray, b_exponent: np.ndarray, mantissa, exponent) -> float:  # type: ignore[no-untyped-def]
+    def _begin(self, row: Rows) -> float:
         """Write alpha_1 = pi b_1 (eq. 2), or b_T beta_T with beta_T = 1 (eq. 4); returns a base."""
-        if self.is_forward:
-            start = self.chain.initial_log
-        else:
-            start = np.where(self.chain.is_node, 0.0, -np.inf)
+        start = self.chain.initial_log if self.is_forward else self.chain.log_node
         with np.errstate(divide="ignore"):
-            log_row = np.log(b, dtype=np.float64) + b_exponent * np.log(2.0) + start
-        base = np.empty(1)
-        kernels.split_rows(log_row[None], mantissa[None], exponent[None], base)
-        self.last[0][:] = np.tile(mantissa, 2)
-        self.last[1][:] = np.tile(exponent, 2)
-        return float(base[0])
+            log_row = np.log(row.b, dtype=np.float64) + row.b_exponent * np.log(2.0) + start
+        base = kernels.split_row(log_row, row.mantissa, row.exponent)
+        self.last[0][:] = np.tile(row.mantissa[0], 2)
+        self.last[1][:] = np.tile(row.exponent[0], 2)
+        return float(base)
 
     def cross(
         self, other: Rows, smoothed: np.ndarray, counts: np.ndarray, counts_first_step: bool
     ) -> float:
-        """Push the message across a block whose other message is known; see `crossing_rows`."""
-        stored = (*other.emission[:2], other.mantissa, other.exponent, smoothed)
-        *rows, smoothed = (row[self.order] for row in stored)
+        """Push the message across steps whose other message is known; see `crossing_rows`."""
         return kernels.crossing_rows(
-            *self.last, *rows, *self.edges, smoothed, counts, counts_first_step
-        )
+            *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, *self.edges,
+            smoothed, counts, counts_first_step, not self.is_forward,
+        )  # fmt: skip
 
 
 class _Half:
     """A message over its own half of the sequence, of which one block is held at a time."""
 
-    def __init__(self, message: _Message, steps: slice) -> None:
-        self.message = message
-        self.starts: list[tuple[slice, list[np.ndarray]]] = []
+    def __init__(self, message: _Message, steps: slice, rows: Rows) -> None:
+        self.message, self.rows = message, rows
+        self.starts: list[tuple[slice, tuple[np.ndarray, ...]]] = []
         self.log_base = 0.0
-        for block in _blocks(steps, BLOCK, from_end=not message.is_forward):
-            self.starts.append((block, [array.copy() for array in message.last]))
-            self.rows = message.advance(block)
-            self.log_base += self.rows.log_base
+        for block in _blocks(steps, len(rows.b), from_end=not message.is_forward):
+            self.starts.append((block, tuple(array.copy() for array in message.last)))
+            self.log_base += message.advance(block, rows)
 
-    def from_middle(self) -> Iterator[tuple[slice, Rows]]:
+    def from_middle(self) -> Iterator[slice]:
         """Yield the blocks, the one nearest the middle first; earlier ones are run once more."""
         block, _ = self.starts.pop()
-        yield block, self.rows
+        yield block
         again = _Message(self.message.chain, self.message.observations, self.message.is_forward)
         for block, last in reversed(self.starts):
-            again.last = (last[0], last[1])
-            yield block, again.advance(block)
+            for array, start in zip(again.last, last, strict=True):
+                array[:] = start
+            again.advance(block, self.rows)
+            yield block
 
 
 class Expectations(NamedTuple):
@@ -260,133 +302,254 @@ class Expectations(NamedTuple):
 
 def expectations(chain: Chain, diagonals: Diagonals, observations: np.ndarray) -> Expectations:
     """Run the E-step over one sequence, float64 (T, D)."""
-    known = ~np.isnan(observations)
-    has_gaps = not known.all()
-    center = np.where(known, observations, 0.0).sum(0) / np.maximum(known.sum(0), 1)
+    obs_dim = observations.shape[1]
+    center, has_gaps = _center(observations)
+    num_features = 1 + (3 if has_gaps else 2) * obs_dim
+    sums = np.zeros((2, num_features, chain.num_cells))  # of either half, so by its own thread
 
-    def gather(block: slice, smoothed: np.ndarray) -> np.ndarray:
-        """Sums of gamma times the features, about `center` for float32's sake."""
-        x = observations[block] - center
-        filled = np.nan_to_num(x) if has_gaps else x
-        ones = np.ones((len(x), 1))
-        features = [ones, filled, filled**2, *([~np.isnan(x)] if has_gaps else [])]
-        sums = np.zeros((sum(f.shape[1] for f in features), chain.num_cells))
-        kernels.add_outer(smoothed, np.concatenate(features, 1, dtype=np.float32), sums)
-        return sums
+    def gather(half: int, steps: slice, smoothed: np.ndarray) -> None:
+        kernels.add_moments(smoothed, observations[steps], center, has_gaps, sums[half])
 
-    parts, edge, initial, log_likelihood = _meet_in_the_middle(chain, observations, gather)
-    total = np.sum(parts, axis=0)[:, chain.cell].T
+    edge, initial, log_likelihood = _meet_in_the_middle(chain, observations, gather)
+    total = sums.sum(0)[:, chain.cell].T
     node = total[:, 0]
-    sums = np.split(total[:, 1:], 3 if has_gaps else 2, axis=1)
-    weight = sums[2] if has_gaps else np.repeat(node[:, None], observations.shape[1], 1)
+    first, second = total[:, 1 : obs_dim + 1], total[:, obs_dim + 1 : 2 * obs_dim + 1]
+    weight = np.repeat(node[:, None], obs_dim, 1)
+    if has_gaps:
+        weight = weight - total[:, 2 * obs_dim + 1 :]
     return Expectations(
         initial[chain.cell],
         node,
         edge[0][diagonals.diagonal, diagonals.target]
         + edge[1][diagonals.diagonal, diagonals.source],
         weight,
-        sums[0] + weight * center,
-        sums[1] + 2 * center * sums[0] + weight * center**2,
+        first + weight * center,
+        second + 2 * center * first + weight * center**2,
         log_likelihood,
     )
+
+
+def _center(observations: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Means of the readings, about which float32 sums lose least, and if any is missing."""
+    total = observations.sum(0)
+    if not np.isnan(total).any():
+        return total / len(observations), False
+    known = (~np.isnan(observations)).sum(0)
+    return np.nansum(observations, 0) / np.maximum(known, 1), True
 
 
 def smooth(chain: Chain, observations: np.ndarray) -> np.ndarray:
     """p(node at t | all observations), float32 (T, N)."""
     out = np.empty((len(observations), len(chain.cell)), np.float32)
 
-    def keep(block: slice, smoothed: np.ndarray) -> None:
-        out[block] = smoothed[:, chain.cell]
+    def keep(half: int, steps: slice, smoothed: np.ndarray) -> None:
+        out[steps] = smoothed[:, chain.cell]
 
     _meet_in_the_middle(chain, observations, keep)
     return out
 
 
-def _meet_in_the_middle(  # type: ignore[no-untyped-def]
-    chain: Chain, observations: np.ndarray, visit: Callable[[slice, np.ndarray], Any]
-):
-    """Form gamma over the whole sequence, block by block, on two threads.
+Visit = Callable[[int, slice, np.ndarray], None]
+"""Called with a half (0 or 1), some of its steps and their gamma, each half on its own thread."""
 
-    Returns what `visit(block, gamma)` gave, in order of time; expected counts by target and by
-    source cell, (O, G) each; gamma_1; the log-likelihood.
+
+def _meet_in_the_middle(  # type: ignore[no-untyped-def]
+    chain: Chain, observations: np.ndarray, visit: Visit
+):
+    """Form gamma over the whole sequence, a few steps at a time, on two threads.
+
+    Returns expected counts by target and by source cell, (2, O, G); gamma_1; the log-likelihood.
     """
     num_steps, shape = len(observations), chain.weight_in.shape
     if num_steps == 1:
         gamma, log_likelihood = filter_rows(chain, observations)
-        return [visit(slice(0, 1), gamma)], np.zeros((2, *shape)), gamma[0], log_likelihood
+        visit(0, slice(0, 1), gamma)
+        return np.zeros((2, *shape)), gamma[0], log_likelihood
     middle = num_steps // 2
+    block = max(1, min(BLOCK, _MAX_ENTRIES // chain.num_cells, num_steps - middle))
     forward, backward = (_Message(chain, observations, ahead) for ahead in (True, False))
-    with ThreadPoolExecutor(2) as pool:
-        halves = pool.map(_Half, (forward, backward), (slice(0, middle), slice(middle, num_steps)))
-        past, future = halves
-        crossings = pool.map(_cross_half, (forward, backward), (future, past), (visit, visit))
-        (late, edge_in, _, log2_joint), (early, edge_out, initial, _) = crossings
+    with (
+        _borrow_rows(block, chain.num_cells) as past_rows,
+        _borrow_rows(block, chain.num_cells) as future_rows,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        past, future = pool.map(
+            _Half,
+            (forward, backward),
+            (slice(0, middle), slice(middle, num_steps)),
+            (past_rows, future_rows),
+        )
+        (edge_in, _, log2_joint), (edge_out, initial, _) = pool.map(
+            _cross_half, (forward, backward), (future, past), (visit, visit)
+        )
     log_likelihood = log2_joint * np.log(2.0) + past.log_base + future.log_base
-    return [*early[::-1], *late], np.stack([edge_in, edge_out]), initial, log_likelihood
+    return np.stack([edge_in, edge_out]), initial, log_likelihood
 
 
-def _cross_half(message: _Message, half: _Half, visit: Callable[[slice, np.ndarray], Any]):  # type: ignore[no-untyped-def]
+def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[no-untyped-def]
     """Carry `message` across the half that the other thread has stored."""
-    results: list[Any] = []
     counts = np.zeros(message.chain.weight_in.shape)
-    log2_joint = None
-    for block, rows in half.from_middle():
-        smoothed = np.empty_like(rows.mantissa)
-        # Both messages take the step over the middle; the forward one counts it.
-        is_counted = message.is_forward or bool(results)
-        first = message.cross(rows, smoothed, counts, is_counted)
-        if first == -np.inf:  # the two halves share no live node
-            raise ValueError(_UNREACHABLE)
-        log2_joint = first if log2_joint is None else log2_joint
-        results.append(visit(block, smoothed))
-    return results, counts, smoothed[0].astype(np.float64), log2_joint
+    buffer = aligned_empty((_CACHE_BLOCK, message.chain.num_cells), np.float32)
+    smoothed, log2_joint = buffer, None
+    for block in half.from_middle():
+        for steps, own in message.parts(block):
+            smoothed = buffer[: steps.stop - steps.start]
+            # Both messages take the step over the middle; the forward one counts it.
+            is_counted = message.is_forward or log2_joint is not None
+            first = message.cross(half.rows.part(own), smoothed, counts, is_counted)
+            if first == -np.inf:  # the two halves share no live node
+                raise ValueError(_UNREACHABLE)
+            log2_joint = first if log2_joint is None else log2_joint
+            visit(int(message.is_forward), steps, smoothed)
+    return counts, smoothed[0].astype(np.float64), log2_joint
 
 
 def filter_rows(chain: Chain, observations: np.ndarray) -> tuple[np.ndarray, float]:
     """p(node at t | observations to t) over cells, float32 (T, G), and the log-likelihood."""
-    forward = _Message(chain, observations, is_forward=True)
     filtered = np.empty((len(observations), chain.num_cells), np.float32)
-    ones = np.ones(filtered.shape[1], np.float32)
-    zeros = np.zeros(filtered.shape[1], np.int32)
-    log_likelihood = log2_last = 0.0
-    for block in _blocks(slice(0, len(observations)), BLOCK):
-        rows = forward.advance(block)
-        log_likelihood += rows.log_base
-        for t in range(block.start, block.stop):
-            row = rows.mantissa[t - block.start], rows.exponent[t - block.start]
-            log2_last = kernels.normalized_product(*row, ones, zeros, filtered[t])
-    return filtered, log_likelihood + log2_last * np.log(2.0)
+
+    def keep(steps: slice, rows: Rows) -> None:
+        kernels.normalized_rows(rows.mantissa, rows.exponent, filtered[steps])
+
+    return filtered, _run_forward(chain, observations, keep)
+
+
+def log_likelihood(chain: Chain, observations: np.ndarray) -> float:
+    """Natural log of the observations' density [nat]; keeps nothing that grows with T."""
+    return _run_forward(chain, observations, lambda steps, rows: None)
+
+
+def _run_forward(
+    chain: Chain, observations: np.ndarray, visit: Callable[[slice, Rows], None]
+) -> float:
+    """Run alpha over the sequence, showing the rows to `visit`; returns the log-likelihood."""
+    forward = _Message(chain, observations, is_forward=True)
+    out, log_base = np.empty((1, chain.num_cells), np.float32), 0.0
+    with _borrow_rows(_CACHE_BLOCK, chain.num_cells) as rows:
+        for steps in _blocks(slice(0, len(observations)), _CACHE_BLOCK):
+            part = rows.part(slice(0, steps.stop - steps.start))
+            log_base += forward.advance(steps, part)
+            visit(steps, part)
+        last = part.part(slice(-1, None))
+        log2_sum = kernels.normalized_rows(last.mantissa, last.exponent, out)
+    return log_base + log2_sum * float(np.log(2.0))
+
+
+class FilterState(NamedTuple):
+    """A belief over nodes between two control steps; `filter_step` advances it in place.
+
+    mantissa, exponent: (2 G,), the belief as `kernels` keeps it, so that no node is ever lost.
+    The rest is scratch, so that a step allocates nothing that grows.
+    """
+
+    mantissa: np.ndarray
+    exponent: np.ndarray
+    rows: Rows
+    out: np.ndarray
+
+
+def start_filter(chain: Chain, belief: np.ndarray | None = None) -> FilterState:
+    """The state before the first step: a belief (N,) about the node before it, or uniform.
+
+    What float64 has flushed to zero in `belief` stays possible: a teleport may need it.
+    """
+    num_cells = chain.num_cells
+    log_row = chain.log_node.copy()
+    if belief is not None:
+        log_row[chain.cell] = np.log(np.maximum(belief, 1e-300))
+    dtypes = (np.float32, np.int32, np.float32, np.int32)
+    rows = Rows(*(aligned_full((1, num_cells), 0, dtype) for dtype in dtypes))
+    kernels.split_row(log_row[None], rows.mantissa, rows.exponent)
+    mantissa, exponent = (
+        aligned_full((2 * num_cells,), 0, dtype) for dtype in (np.float32, np.int32)
+    )
+    mantissa[:], exponent[:] = np.tile(rows.mantissa[0], 2), np.tile(rows.exponent[0], 2)
+    return FilterState(mantissa, exponent, rows, aligned_full((1, num_cells), 0, np.float32))
+
+
+def filter_step(
+    chain: Chain, state: FilterState, observation: np.ndarray, teleport: float = 0.0
+) -> tuple[np.ndarray, float]:
+    """Push the belief over the edges and weigh it by an observation, float64 (D,).
+
+    Args:
+        chain: the model; another one of the same lattice may follow at any step.
+        state: advanced in place.
+        observation: NaN is a missing reading.
+        teleport: share of the belief that is spread over all nodes before the observation counts.
+
+    Returns:
+        p(node | observations so far), float32 (N,), and log p(observation | those before) [nat].
+    """
+    rows, base = state.rows, np.empty(1)
+    kernels.emission_rows(observation[None], *_gaussians(chain), rows.b, rows.b_exponent, base)
+    jump = teleport / (len(chain.cell) * (1 - teleport))
+    log2_sum, before = kernels.filter_row(
+        state.mantissa, state.exponent, rows.b, rows.b_exponent,
+        chain.shift_in, chain.weight_in, chain.weight_in_exponent,
+        jump, rows.mantissa, rows.exponent, state.out,
+    )  # fmt: skip
+    if log2_sum == -np.inf:
+        raise ValueError(_UNREACHABLE)
+    log_sum = log2_sum * np.log(2.0) - np.log(before) + np.log1p(-teleport)
+    return state.out[0, chain.cell], float(log_sum + base[0])
 
 
 def most_likely_path(chain: Chain, observations: np.ndarray) -> np.ndarray:
-    """Viterbi's path (section 2.3), int64 (T,) node indices; exact ties go to the lower shift."""
-    log_weight = _log_weight_in(chain)
-    score = np.tile(chain.initial_log + log_emission(chain, observations[:1])[0], 2)
-    choice = np.empty((len(observations) - 1, chain.num_cells), np.uint16)
-    for block in _blocks(slice(0, len(choice)), _CACHE_BLOCK):
-        log_rows = log_emission(chain, observations[1:][block])
-        kernels.best_rows(score, log_rows, chain.shift_in, log_weight, choice[block])
+    """Viterbi's path (section 2.3), int64 (T,) node indices; exact ties go to the lower shift.
+
+    The choices of one block are held; those before it are made again from the scores at its start.
+    """
+    score = _first_score(chain, observations)
+    blocks = list(_blocks(slice(0, len(observations) - 1), _path_block(chain)))
+    choice = np.empty((min(len(observations) - 1, _path_block(chain)), chain.num_cells), np.uint16)
+    starts = []
+    for block in blocks:
+        starts.append(score.copy())
+        _choose(chain, observations, block, score, choice)
     path = np.empty(len(observations), np.int64)
-    last = int(score[: chain.num_cells].argmax())
-    kernels.backtrack(choice, chain.shift_in, last, path)
+    path[-1] = score[: chain.num_cells].argmax()
+    for block, start in reversed(list(zip(blocks, starts, strict=True))):
+        if block is not blocks[-1]:
+            _choose(chain, observations, block, start, choice)
+        steps = slice(block.start, block.stop + 1)
+        own = choice[: block.stop - block.start]
+        kernels.backtrack(own, chain.shift_in, path[block.stop], path[steps])
     node_of_cell = np.full(chain.num_cells, -1)
     node_of_cell[chain.cell] = np.arange(len(chain.cell))
     return node_of_cell[path]
 
 
+def _path_block(chain: Chain) -> int:
+    """Steps whose choices are held at once."""
+    return max(1, min(BLOCK, _MAX_ENTRIES // chain.num_cells))
+
+
+def _first_score(chain: Chain, observations: np.ndarray) -> np.ndarray:
+    return np.tile(chain.initial_log + log_emission(chain, observations[:1])[0], 2)
+
+
+def _choose(
+    chain: Chain, observations: np.ndarray, block: slice, score: np.ndarray, choice: np.ndarray
+) -> None:
+    """Run Viterbi's recursion over the steps after each of `block`, from `score`, in place."""
+    for steps in _blocks(block, _CACHE_BLOCK):
+        log_rows = log_emission(chain, observations[1:][steps])
+        own = choice[steps.start - block.start : steps.stop - block.start]
+        kernels.best_rows(score, log_rows, chain.shift_in, chain.log_weight_in, own)
+
+
 def viterbi_scores(chain: Chain, observations: np.ndarray) -> np.ndarray:
     """Logs of delta_T (section 2.3) over nodes, (N,), relative to the best path of all."""
-    score = np.tile(chain.initial_log + log_emission(chain, observations[:1])[0], 2)
-    log_rows = log_emission(chain, observations[1:])
-    choice = np.empty(log_rows.shape, np.uint16)
-    kernels.best_rows(score, log_rows, chain.shift_in, _log_weight_in(chain), choice)
+    return window_scores(chain, log_emission(chain, observations))
+
+
+def window_scores(chain: Chain, log_rows: np.ndarray) -> np.ndarray:
+    """`viterbi_scores` from rows of `log_emission` (T, G), which a caller may keep."""
+    score = np.tile(chain.initial_log + log_rows[0], 2)
+    choice = np.empty((len(log_rows) - 1, chain.num_cells), np.uint16)
+    kernels.best_rows(score, log_rows[1:], chain.shift_in, chain.log_weight_in, choice)
     return score[chain.cell] - score.max()
-
-
-def _log_weight_in(chain: Chain) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        log_mantissa = np.log(chain.weight_in, dtype=np.float64)
-    return log_mantissa + np.where(chain.weight_in > 0, chain.weight_in_exponent * np.log(2.0), 0.0)
 
 
 def _blocks(steps: slice, size: int, from_end: bool = False) -> Iterator[slice]:

@@ -6,7 +6,8 @@ in [1, 2), or 0) and an exponent of its own (int32, base 2); no log or exp is ta
 
 Transitions are stored by diagonal: node i sits in cell c of a lattice of G cells, an edge leads
 from cell c to cell (c + shift[o]) mod G, and `weight[o, c]` is its probability, 0 where there is no
-edge. A grid has few distinct shifts, so one step is a handful of contiguous multiply-adds.
+edge. A grid has few distinct shifts, so one step is a handful of contiguous multiply-adds, taken
+`simd.LANES` cells at a time; G is a multiple of that.
 
     alpha_t(i), beta_t(i)   rows of (mantissa, exponent), each relative to `base[t]`
     a_ij                    weight[o, c], again as mantissa and exponent
@@ -20,329 +21,519 @@ Sources: Rabiner and Juang (1993), eqs. (1)-(10) of the paper; the separate expo
 import math
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
+
+from rfl_torch.simd import (
+    LANES,
+    add_lanes,
+    aligned_row,
+    any_lane,
+    as_bits,
+    as_float,
+    broadcast,
+    greater,
+    largest,
+    load,
+    load_one,
+    maximum,
+    narrow,
+    prefetch,
+    round_down,
+    store,
+    to_int,
+    where,
+    widen,
+)  # fmt: skip
 
 ABSENT = -(1 << 28)
 """Exponent of a zero: below every real one, and sums of three of them still fit an int32."""
 
-_LN_2 = math.log(2.0)
-_LOG2_E = 1.0 / _LN_2
+NEGLIGIBLE = 2.0**-100
+"""Posterior below which a cell is left out of a step's sums: they lose at most T times this."""
+
 _FLAGS = {"contract", "nsz", "arcp"}  # never nnan/ninf: infinities and NaN keep their meaning
 
-
-@intrinsic
-def _as_float(typing_context, bits):  # type: ignore[no-untyped-def]
-    """Reinterpret an int32 as the float32 with the same bits."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.bitcast(args[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
-@intrinsic
-def _as_bits(typing_context, value):  # type: ignore[no-untyped-def]
-    """Reinterpret a float32 as the int32 with the same bits."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.bitcast(args[0], ir.IntType(32))
-
-    return types.int32(types.float32), generate
+_LN_2 = math.log(2.0)
+_LOG2_E = 1.0 / _LN_2
+_ABSENT, _NOTHING = np.int32(ABSENT), np.int32(2 * ABSENT)  # int32: a Python int would widen
+_ZERO, _ONE, _NEGLIGIBLE = np.float32(0.0), np.float32(1.0), np.float32(NEGLIGIBLE)
+_SMALLEST, _BIAS, _SHIFT = np.int32(1), np.int32(127), np.int32(23)  # of a float32's exponent
+_FRACTION, _EXPONENT = np.int32(0x7FFFFF), np.int32(0xFF)
+_TINY = np.float32(1e-30)
+_TAYLOR = tuple(np.float32(1.0 / math.factorial(n)) for n in range(7, 1, -1))
 
 
-@njit(inline="always")
-def _power_of_two(exponent):  # type: ignore[no-untyped-def]
-    """2**exponent for an int32 exponent <= 0; what is under 2**-126 becomes 2**-126."""
-    clipped = max(exponent, np.int32(-126))
-    return _as_float(np.int32((clipped + np.int32(127)) << np.int32(23)))
+@njit(forceinline=True)
+def _power_of_two(biased):  # type: ignore[no-untyped-def]
+    """2**(biased - 127) for biased <= 127; what is under 2**-126 becomes 2**-126."""
+    return as_float(maximum(biased, broadcast(_SMALLEST)) << _SHIFT)
 
 
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def emission_rows(observations, inverse_scale, scaled_mean, log_norm, temperature, out):  # type: ignore[no-untyped-def]
-    """Evaluate log b_j(o_t) * temperature (eq. 1) in float64 [nat]; NaN readings are marginalised.
-
-    Sums squared differences, so neither a narrow Gaussian nor an outlier cancels. Four steps share
-    each read of the parameters.
-    observations (T, D); inverse_scale, scaled_mean = mean * inverse_scale, log_norm (D, G);
-    out (T, G).
-    """
-    num_steps, obs_dim = observations.shape
-    num_cells = out.shape[1]
-    norm = np.zeros(num_cells)
-    for d in range(obs_dim):
-        norm += log_norm[d]
-    start = 0
-    while start < num_steps:
-        stop = min(start + 4, num_steps)
-        has_gap = False
-        for t in range(start, stop):
-            for d in range(obs_dim):
-                has_gap = has_gap or math.isnan(observations[t, d])
-        if stop - start == 4 and not has_gap:
-            _four_rows(observations[start:stop], inverse_scale, scaled_mean, out[start:stop])
-            for t in range(start, stop):
-                for j in range(num_cells):
-                    out[t, j] = temperature * (norm[j] - 0.5 * out[t, j])
-        else:
-            for t in range(start, stop):
-                _one_row(observations[t], inverse_scale, scaled_mean, log_norm, out[t])
-                out[t] *= temperature
-        start = stop
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _four_rows(x, inverse_scale, scaled_mean, out):  # type: ignore[no-untyped-def]
-    """Squared scaled distances of four complete observations."""
-    out[:] = 0.0
-    row0, row1, row2, row3 = out[0], out[1], out[2], out[3]
-    for d in range(x.shape[1]):
-        x0, x1, x2, x3 = x[0, d], x[1, d], x[2, d], x[3, d]
-        factor, offset = inverse_scale[d], scaled_mean[d]
-        for j in range(row0.shape[0]):
-            z0 = x0 * factor[j] - offset[j]
-            z1 = x1 * factor[j] - offset[j]
-            z2 = x2 * factor[j] - offset[j]
-            z3 = x3 * factor[j] - offset[j]
-            row0[j] += z0 * z0
-            row1[j] += z1 * z1
-            row2[j] += z2 * z2
-            row3[j] += z3 * z3
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _one_row(x, inverse_scale, scaled_mean, log_norm, out):  # type: ignore[no-untyped-def]
-    """Log-density of one observation over its readings that are not NaN."""
-    out[:] = 0.0
-    for d in range(x.shape[0]):
-        if math.isnan(x[d]):
-            continue
-        for j in range(out.shape[0]):
-            z = x[d] * inverse_scale[d, j] - scaled_mean[d, j]
-            out[j] += log_norm[d, j] - 0.5 * z * z
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def split_rows(log_rows, mantissa, exponent, base):  # type: ignore[no-untyped-def]
-    """exp(log_rows) as mantissas and exponents relative to each row's largest, `base` [nat].
-
-    What lies more than 1.8e8 nats under its row's largest value becomes a zero.
-    """
-    for t in range(log_rows.shape[0]):
-        largest = -np.inf
-        for j in range(log_rows.shape[1]):
-            largest = max(largest, log_rows[t, j])
-        base[t] = largest
-        for j in range(log_rows.shape[1]):
-            value = max((log_rows[t, j] - largest) * _LOG2_E, float(ABSENT))
-            whole = math.floor(value + 0.5)
-            x = np.float32((value - whole) * _LN_2)
-            p = np.float32(1.0 / 5040.0)
-            p = p * x + np.float32(1.0 / 720.0)
-            p = p * x + np.float32(1.0 / 120.0)
-            p = p * x + np.float32(1.0 / 24.0)
-            p = p * x + np.float32(1.0 / 6.0)
-            p = p * x + np.float32(0.5)
-            p = p * x + np.float32(1.0)
-            p = p * x + np.float32(1.0)
-            mantissa[t, j] = p if value > ABSENT else np.float32(0.0)
-            exponent[t, j] = np.int32(whole)
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _gather(mantissa, exponent, shift, weight, weight_exponent, top, total, term):  # type: ignore[no-untyped-def]
-    """Sum over edges: total[c] * 2**top[c] = sum_o weight[o, c] * message[(c + shift[o]) mod G].
-
-    mantissa, exponent: (2 G,), the message written twice so that a shifted read is contiguous.
-    term: (O, G), the summands at the scale 2**top[c], kept for the expected counts.
-    """
-    num_cells = top.shape[0]
-    top[:] = np.int32(2 * ABSENT)
-    total[:] = np.float32(0.0)
-    for o in range(shift.shape[0]):
-        _raise_top(top, exponent[shift[o] : shift[o] + num_cells], weight_exponent[o])
-    for o in range(shift.shape[0]):
-        window = slice(shift[o], shift[o] + num_cells)
-        _add_scaled(
-            total, term[o], mantissa[window], weight[o], exponent[window], weight_exponent[o], top
-        )
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _raise_top(top, exponent, weight_exponent):  # type: ignore[no-untyped-def]
-    """Set top = max(top, exponent + weight_exponent); alone in a function, it vectorises."""
-    for c in range(top.shape[0]):
-        top[c] = max(top[c], np.int32(exponent[c] + weight_exponent[c]))
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _add_scaled(total, term, mantissa, weight, exponent, weight_exponent, top):  # type: ignore[no-untyped-def]
-    """Do total += mantissa * weight * 2**(exponents - top), keeping the summand in `term`."""
-    for c in range(total.shape[0]):
-        scale = _power_of_two(np.int32(exponent[c] + weight_exponent[c] - top[c]))
-        product = weight[c] * mantissa[c] * scale
-        term[c] = product
-        total[c] += product
-
-
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _scaled_product(a, a_exponent, b, b_exponent, mantissa, exponent):  # type: ignore[no-untyped-def]
-    """(a 2**ea)(b 2**eb), normalised; returns the largest exponent."""
-    largest = np.int32(2 * ABSENT)
-    for c in range(mantissa.shape[0]):
-        product = a[c] * b[c]
-        bits = _as_bits(product)
-        is_zero = product == np.float32(0.0)
-        own = ((bits >> np.int32(23)) & np.int32(255)) - np.int32(127)
-        one_to_two = _as_float((bits & np.int32(0x7FFFFF)) | np.int32(0x3F800000))
-        mantissa[c] = np.float32(0.0) if is_zero else one_to_two
-        exponent[c] = np.int32(ABSENT) if is_zero else own + a_exponent[c] + b_exponent[c]
-        largest = max(largest, exponent[c])
-    return largest
+@njit(forceinline=True)
+def _exponential(x):  # type: ignore[no-untyped-def]
+    """e**x for |x| <= ln(2) / 2, to a float32's last place."""
+    p = x * _TAYLOR[0] + _TAYLOR[1]
+    p = p * x + _TAYLOR[2]
+    p = p * x + _TAYLOR[3]
+    p = p * x + _TAYLOR[4]
+    p = p * x + _TAYLOR[5]
+    return (p * x + _ONE) * x + _ONE
 
 
 @njit(nogil=True, cache=True)
-def _write_twice(mantissa, exponent, base, twice_mantissa, twice_exponent):  # type: ignore[no-untyped-def]
-    """Lay a row out twice and bring its largest exponent to 0, in both copies."""
-    num_cells = mantissa.shape[0]
-    for c in range(num_cells):
-        exponent[c] = max(exponent[c] - base, np.int32(ABSENT))
-        twice_mantissa[c] = mantissa[c]
-        twice_exponent[c] = exponent[c]
-    twice_mantissa[num_cells:] = mantissa
-    twice_exponent[num_cells:] = exponent
+def log_emission_rows(observations, inverse_scale, scaled_mean, log_norm, log_node, power, out):  # type: ignore[no-untyped-def]
+    """Evaluate log b_j(o_t) * power (eq. 1) in float64 [nat]; NaN readings are marginalised.
+
+    Sums squared differences, so neither a narrow Gaussian nor an outlier cancels.
+    observations (T, D); inverse_scale, scaled_mean = mean * inverse_scale, log_norm (D, G);
+    log_node (G,), -inf in empty cells; out (T, G).
+    """
+    norm = _whole_norm(log_norm, log_node)
+    for start in range(0, len(observations), 4):
+        _log_rows(
+            observations, start, inverse_scale, scaled_mean, log_norm, log_node, norm, power,
+            out, start,
+        )  # fmt: skip
+
+
+@njit(forceinline=True)
+def _whole_norm(log_norm, log_node):  # type: ignore[no-untyped-def]
+    """Logarithm of the densities' factor where no reading is missing."""
+    norm = log_node.copy()
+    for d in range(log_norm.shape[0]):
+        norm += log_norm[d]
+    return norm
+
+
+@njit
+def _log_rows(  # type: ignore[no-untyped-def]
+    observations, start, inverse_scale, scaled_mean, log_norm, log_node, norm, power, out, first_row
+):
+    """Up to four rows from `start` on, into `out` from `first_row` on; complete ones together.
+
+    A row's bits do not depend on the rows that it is evaluated with.
+    """
+    count = min(4, len(observations) - start)
+    has_gap = False
+    for t in range(start, start + count):
+        has_gap = has_gap or _is_incomplete(observations, t)
+    if not has_gap:
+        _four_rows(
+            observations, start, count - 1, inverse_scale, scaled_mean, norm, power, out, first_row
+        )  # fmt: skip
+        return
+    for k in range(count):
+        t = start + k
+        if _is_incomplete(observations, t):
+            _one_row(
+                observations[t], inverse_scale, scaled_mean, log_norm, log_node, power,
+                out, first_row + k,
+            )  # fmt: skip
+        else:
+            _four_rows(
+                observations, t, 0, inverse_scale, scaled_mean, norm, power, out, first_row + k
+            )  # fmt: skip
+
+
+@njit(forceinline=True)
+def _is_incomplete(observations, t):  # type: ignore[no-untyped-def]
+    found = False
+    for d in range(observations.shape[1]):
+        found |= math.isnan(observations[t, d])
+    return found
+
+
+@njit
+def _four_rows(  # type: ignore[no-untyped-def]
+    x, start, last, inverse_scale, scaled_mean, norm, power, out, first_row
+):
+    """Rows of complete observations start .. start + last; each read of the parameters serves all.
+
+    Fewer than four repeat the last one.
+    """
+    obs_dim, num_cells = inverse_scale.shape
+    k1, k2, k3 = min(1, last), min(2, last), min(3, last)
+    t0, t1 = start * obs_dim, (start + k1) * obs_dim
+    t2, t3 = (start + k2) * obs_dim, (start + k3) * obs_dim
+    for c in range(0, num_cells, LANES):
+        sum0 = broadcast(0.0)
+        sum1, sum2, sum3 = sum0, sum0, sum0
+        for d in range(obs_dim):
+            factor = load(inverse_scale, d * num_cells + c)
+            offset = load(scaled_mean, d * num_cells + c)
+            z0 = factor * load_one(x, t0 + d) - offset
+            z1 = factor * load_one(x, t1 + d) - offset
+            z2 = factor * load_one(x, t2 + d) - offset
+            z3 = factor * load_one(x, t3 + d) - offset
+            sum0 += z0 * z0
+            sum1 += z1 * z1
+            sum2 += z2 * z2
+            sum3 += z3 * z3
+        whole = load(norm, c)
+        store((whole - sum0 * 0.5) * power, out, first_row * num_cells + c)
+        store((whole - sum1 * 0.5) * power, out, (first_row + k1) * num_cells + c)
+        store((whole - sum2 * 0.5) * power, out, (first_row + k2) * num_cells + c)
+        store((whole - sum3 * 0.5) * power, out, (first_row + k3) * num_cells + c)
+
+
+@njit
+def _one_row(x, inverse_scale, scaled_mean, log_norm, log_node, power, out, row):  # type: ignore[no-untyped-def]
+    """Log-density of one observation over its readings that are not NaN."""
+    obs_dim, num_cells = inverse_scale.shape
+    for c in range(0, num_cells, LANES):
+        total = load(log_node, c)
+        for d in range(obs_dim):
+            if not math.isnan(x[d]):
+                i = d * num_cells + c
+                z = load(inverse_scale, i) * x[d] - load(scaled_mean, i)
+                total += load(log_norm, i) - z * z * 0.5
+        store(total * power, out, row * num_cells + c)
+
+
+@njit(nogil=True, cache=True)
+def emission_rows(  # type: ignore[no-untyped-def]
+    observations, inverse_scale, scaled_mean, log_norm, log_node, power, mantissa, exponent, base
+):
+    """Split b_j(o_t) ** power into mantissas and exponents (T, G) and `base` (T,) [nat].
+
+    Exponents are relative to the row's largest value; what lies more than 1.8e8 nats under it
+    becomes a zero.
+    """
+    norm = _whole_norm(log_norm, log_node)
+    log_rows = aligned_row(4 * inverse_scale.shape[1], 0.0).reshape(4, -1)
+    for start in range(0, len(observations), 4):
+        _log_rows(
+            observations, start, inverse_scale, scaled_mean, log_norm, log_node, norm, power,
+            log_rows, 0,
+        )  # fmt: skip
+        for t in range(start, min(start + 4, len(observations))):
+            base[t] = _split_row(log_rows, t - start, mantissa, exponent, t)
+
+
+@njit(nogil=True, cache=True)
+def split_row(log_row, mantissa, exponent):  # type: ignore[no-untyped-def]
+    """One row (1, G) of logs [nat] as mantissas and exponents (1, G); returns its base [nat]."""
+    return _split_row(log_row, 0, mantissa, exponent, 0)
+
+
+@njit
+def _split_row(log_rows, row, mantissa, exponent, t):  # type: ignore[no-untyped-def]
+    """exp(log_rows[row]) as mantissas and exponents relative to the largest, which is returned."""
+    num_cells = log_rows.shape[1]
+    top = broadcast(-np.inf)
+    for c in range(0, num_cells, LANES):
+        top = maximum(load(log_rows, row * num_cells + c), top)
+    base = largest(top)
+    lowest = broadcast(float(ABSENT))
+    for c in range(0, num_cells, LANES):
+        value = maximum((load(log_rows, row * num_cells + c) - base) * _LOG2_E, lowest)
+        whole = round_down(value + 0.5)
+        p = _exponential(narrow((value - whole) * _LN_2))
+        is_there = greater(value, lowest)
+        store(where(is_there, p, broadcast(_ZERO)), mantissa, t * num_cells + c)
+        store(to_int(whole), exponent, t * num_cells + c)
+    return base
+
+
+@njit(forceinline=True)
+def _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving):  # type: ignore[no-untyped-def]
+    """Sum over the edges of a tile: sum_o weight[o, c] * message[c + shift[o]] = total * 2**top.
+
+    mantissa, exponent: (2 G,), the message written twice so that a shifted read is contiguous.
+    arriving: int32 (O * LANES,), scratch for the summands' exponents.
+    """
+    num_shifts, num_cells = weight.shape
+    top = broadcast(_NOTHING)
+    for o in range(num_shifts):
+        own = load(exponent, load_one(shift, o) + c) + load(weight_exponent, o * num_cells + c)
+        store(own, arriving, o * LANES)
+        top = maximum(own, top)
+    total, bottom = broadcast(_ZERO), top - _BIAS
+    for o in range(num_shifts):
+        scale = _power_of_two(load(arriving, o * LANES) - bottom)
+        product = load(mantissa, load_one(shift, o) + c) * load(weight, o * num_cells + c)
+        total += product * scale
+    return top, total
+
+
+@njit(forceinline=True)
+def _normalize(product, exponent):  # type: ignore[no-untyped-def]
+    """Bring product * 2**exponent to a mantissa in [1, 2)."""
+    bits = as_bits(product)
+    own = ((bits >> _SHIFT) & _EXPONENT) - _BIAS
+    one_to_two = as_float((bits & _FRACTION) | as_bits(broadcast(_ONE)))
+    is_there = greater(product, broadcast(_ZERO))
+    return where(is_there, one_to_two, broadcast(_ZERO)), where(
+        is_there, own + exponent, broadcast(_ABSENT)
+    )
+
+
+@njit(forceinline=True)
+def _rebase(mantissa, exponent, base, row, row_exponent, first):  # type: ignore[no-untyped-def]
+    """Bring a row's largest exponent to 0, and lay it out twice as the next step's message."""
+    num_cells = len(mantissa) // 2
+    for c in range(0, num_cells, LANES):
+        value = load(row, first + c)
+        own = maximum(load(row_exponent, first + c) - base, broadcast(_ABSENT))
+        store(own, row_exponent, first + c)
+        store(value, mantissa, c)
+        store(value, mantissa, num_cells + c)
+        store(own, exponent, c)
+        store(own, exponent, num_cells + c)
 
 
 @njit(nogil=True, cache=True)
 def message_rows(  # type: ignore[no-untyped-def]
-    mantissa, exponent, b, b_exponent, shift, weight, weight_exponent, row, row_exponent, base
-):
+    mantissa, exponent, b, b_exponent, shift, weight, weight_exponent,
+    row, row_exponent, base, backward,
+):  # fmt: skip
     """Run b_t(j) * sum_i a_ij * message over a block, storing every row and its base.
 
-    Forward (eq. 3): `weight` by destination, rows in time order. Backward (eq. 5): `weight` by
-    source, rows in reversed time order, and the rows are b_t beta_t, the message that eq. 5 sums.
+    Forward (eq. 3): `weight` by destination. Backward (eq. 5): `weight` by source, last row first,
+    and the rows are b_t beta_t, the message that eq. 5 sums.
     mantissa, exponent (2 G,): the message before the block; on return, after it.
     Returns False if some step has no mass at all.
     """
-    num_cells = row.shape[1]
-    top = np.empty(num_cells, np.int32)
-    total = np.empty(num_cells, np.float32)
-    term = np.empty((shift.shape[0], num_cells), np.float32)
-    for t in range(row.shape[0]):
-        _gather(mantissa, exponent, shift, weight, weight_exponent, top, total, term)
-        largest = _scaled_product(total, top, b[t], b_exponent[t], row[t], row_exponent[t])
-        if largest <= ABSENT:
+    num_steps, num_cells = row.shape
+    arriving = aligned_row(len(shift) * LANES, _ABSENT)
+    ahead = -num_cells if backward else num_cells
+    for k in range(num_steps):
+        t = num_steps - 1 - k if backward else k
+        top_of_row = broadcast(_NOTHING)
+        for c in range(0, num_cells, LANES):
+            i = t * num_cells + c
+            prefetch(b, i + ahead)  # the machine does not expect a stream that runs backwards
+            prefetch(b_exponent, i + ahead)
+            top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
+            value, own = _normalize(total * load(b, i), top + load(b_exponent, i))
+            store(value, row, i)
+            store(own, row_exponent, i)
+            top_of_row = maximum(own, top_of_row)
+        base[t] = largest(top_of_row)
+        if base[t] <= ABSENT:
             return False
-        _write_twice(row[t], row_exponent[t], largest, mantissa, exponent)
-        base[t] = largest
+        _rebase(mantissa, exponent, np.int32(base[t]), row, row_exponent, t * num_cells)
     return True
 
 
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def normalized_product(a, a_exponent, b, b_exponent, out):  # type: ignore[no-untyped-def]
-    """Write a*b as probabilities that sum to one; returns (log2 of the sum) or -inf."""
-    top = np.int32(4 * ABSENT)
-    for c in range(out.shape[0]):
-        alive = a[c] * b[c] > np.float32(0.0)
-        top = max(top, a_exponent[c] + b_exponent[c] if alive else np.int32(4 * ABSENT))
-    total = np.float64(0.0)
-    for c in range(out.shape[0]):
-        out[c] = a[c] * b[c] * _power_of_two(min(a_exponent[c] + b_exponent[c] - top, np.int32(0)))
-        total += out[c]
+@njit(nogil=True, cache=True)
+def normalized_rows(row, row_exponent, out):  # type: ignore[no-untyped-def]
+    """Write rows (T, G) as probabilities that sum to one; returns the last row's log2 sum."""
+    num_steps, num_cells = row.shape
+    log2_sum = 0.0
+    for t in range(num_steps):
+        top = broadcast(_NOTHING)
+        for c in range(0, num_cells, LANES):
+            top = maximum(load(row_exponent, t * num_cells + c), top)
+        log2_sum = _to_probabilities(row, row_exponent, t * num_cells, largest(top), out, t)
+    return log2_sum
+
+
+@njit(forceinline=True)
+def _to_probabilities(product, exponent, first, top, out, t):  # type: ignore[no-untyped-def]
+    """Write product * 2**(exponent - top) to out[t], divided by its sum; returns its log2."""
+    num_cells = out.shape[1]
+    sums, bottom = broadcast(0.0), np.int32(top - _BIAS)
+    for c in range(0, num_cells, LANES):
+        scale = _power_of_two(load(exponent, first + c) - bottom)
+        value = load(product, first + c) * scale
+        store(value, out, t * num_cells + c)
+        sums += widen(value)
+    total = add_lanes(sums)
     if total == 0.0:
         return -np.inf
-    scale = np.float32(1.0 / total)
-    for c in range(out.shape[0]):
-        out[c] *= scale
+    factor = np.float32(1.0 / total)
+    for c in range(0, num_cells, LANES):
+        store(load(out, t * num_cells + c) * factor, out, t * num_cells + c)
     return math.log2(total) + top
 
 
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
+@njit(nogil=True, cache=True)
 def crossing_rows(  # type: ignore[no-untyped-def]
     mantissa, exponent, b, b_exponent, other, other_exponent,
-    shift, weight, weight_exponent, smoothed, counts, counts_first_step,
+    shift, weight, weight_exponent, smoothed, counts, counts_first_step, backward,
 ):  # fmt: skip
     """Carry one message across a block whose other message is stored: gamma and sum of xi.
 
-    At each step the message is pushed through the edges, gamma_t = pushed * other, and the edge's
+    At each step the message is pushed through the edges, gamma_t = pushed * other, and an edge's
     share of gamma is its share of the push, so xi needs no product of its own:
     xi_t(i, j) = gamma_t(c) * term[o, c] / total[c].
     other (T, G): the stored rows. Forward: `other` = b_t beta_t rows and the emission enters after
-    gamma is formed; backward: `other` = alpha_t rows. `counts` (O, G) float64 is added to, the
-    block's first step only if `counts_first_step`.
+    gamma is formed; backward: `other` = alpha_t rows, last row first. `counts` (O, G) float64 is
+    added to, the block's first step only if `counts_first_step`.
     Returns log2 of the first step's normaliser, sum of pushed * other: with the bases of both
     messages it is the log-likelihood.
     """
-    num_cells = smoothed.shape[1]
-    num_shifts = shift.shape[0]
-    top = np.empty(num_cells, np.int32)
-    total = np.empty(num_cells, np.float32)
-    ratio = np.empty(num_cells, np.float32)
-    term = np.empty((num_shifts, num_cells), np.float32)
-    part = np.zeros((num_shifts, num_cells), np.float32)
-    row = np.empty(num_cells, np.float32)
-    row_exponent = np.empty(num_cells, np.int32)
+    num_steps, num_cells = smoothed.shape
+    totals, tops = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
+    joint, joint_exponent = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
+    row, row_exponent = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
+    part = aligned_row(weight.size, _ZERO)
+    arriving = aligned_row(len(shift) * LANES, _ABSENT)
+    ahead = -num_cells if backward else num_cells
     first_log2_sum = 0.0
-    for t in range(smoothed.shape[0]):
-        _gather(mantissa, exponent, shift, weight, weight_exponent, top, total, term)
-        log2_sum = normalized_product(total, top, other[t], other_exponent[t], smoothed[t])
-        if t == 0:
-            first_log2_sum = log2_sum
-        for c in range(num_cells):
-            ratio[c] = smoothed[t, c] / max(total[c], np.float32(1e-30))
-        for o in range(num_shifts):
-            _add_product(part[o], ratio, term[o])
-        if t == 0 and not counts_first_step:
-            part[:] = 0.0
-        if t % 256 == 255 or t == smoothed.shape[0] - 1:  # float32 sums stay short
-            for o in range(num_shifts):
-                for c in range(num_cells):
-                    counts[o, c] += part[o, c]
-                    part[o, c] = np.float32(0.0)
-        largest = _scaled_product(total, top, b[t], b_exponent[t], row, row_exponent)
-        _write_twice(row, row_exponent, largest, mantissa, exponent)
+    for k in range(num_steps):
+        t = num_steps - 1 - k if backward else k
+        top_of_row, top_of_joint = broadcast(_NOTHING), broadcast(np.int32(4 * ABSENT))
+        for c in range(0, num_cells, LANES):
+            i = t * num_cells + c
+            prefetch(b, i + ahead)
+            prefetch(b_exponent, i + ahead)
+            prefetch(other, i + ahead)
+            prefetch(other_exponent, i + ahead)
+            top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
+            store(top, tops, c)
+            store(total, totals, c)
+            product = total * load(other, i)
+            is_there = greater(product, broadcast(_ZERO))
+            own = where(is_there, top + load(other_exponent, i), broadcast(np.int32(4 * ABSENT)))
+            store(product, joint, c)
+            store(own, joint_exponent, c)
+            top_of_joint = maximum(own, top_of_joint)
+            value, own = _normalize(total * load(b, i), top + load(b_exponent, i))
+            store(value, row, c)
+            store(own, row_exponent, c)
+            top_of_row = maximum(own, top_of_row)
+        log2_sum = _to_probabilities(joint, joint_exponent, 0, largest(top_of_joint), smoothed, t)
+        first_log2_sum = log2_sum if k == 0 else first_log2_sum
+        if k > 0 or counts_first_step:
+            _count(mantissa, exponent, shift, weight_exponent, tops, totals, smoothed, t, part)
+        if k % 64 == 63 or k == num_steps - 1:  # float32 sums stay short
+            _add_weighted(part, weight, counts)
+        _rebase(mantissa, exponent, largest(top_of_row), row, row_exponent, 0)
     return first_log2_sum
 
 
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _add_product(total, a, b):  # type: ignore[no-untyped-def]
-    """Do total += a * b."""
-    for c in range(total.shape[0]):
-        total[c] += a[c] * b[c]
+@njit(forceinline=True)
+def _count(mantissa, exponent, shift, weight_exponent, tops, totals, smoothed, t, part):  # type: ignore[no-untyped-def]
+    """Add a step's xi, short of the factor `weight`, to `part`, but where gamma is negligible."""
+    num_shifts, num_cells = len(shift), smoothed.shape[1]
+    for c in range(0, num_cells, LANES):
+        gamma = load(smoothed, t * num_cells + c)
+        if not any_lane(greater(gamma, broadcast(_NEGLIGIBLE))):
+            continue
+        bottom = load(tops, c) - _BIAS
+        ratio = gamma / maximum(load(totals, c), broadcast(_TINY))
+        for o in range(num_shifts):
+            source, i = load_one(shift, o) + c, o * num_cells + c
+            scale = _power_of_two(load(exponent, source) + load(weight_exponent, i) - bottom)
+            store(load(part, i) + ratio * (load(mantissa, source) * scale), part, i)
+
+
+@njit(forceinline=True)
+def _add_weighted(part, weight, counts):  # type: ignore[no-untyped-def]
+    """Do counts += part * weight in float64, and empty `part`."""
+    for i in range(0, part.size, LANES):
+        product = widen(load(part, i)) * widen(load(weight, i))
+        store(load(counts, i) + product, counts, i)
+        store(broadcast(_ZERO), part, i)
 
 
 @njit(nogil=True, cache=True)
-def add_outer(smoothed, features, sums):  # type: ignore[no-untyped-def]
-    """Do sums (F, G) float64 += features (T, F) transposed times smoothed (T, G), both float32.
+def add_moments(smoothed, observations, center, with_gaps, sums):  # type: ignore[no-untyped-def]
+    """Do sums (F, G) float64 += features (T, F) transposed times smoothed (T, G) float32.
 
-    A BLAS would spend longer waking its threads for blocks that fit the cache.
+    The features are 1, x and x**2 with x = observations - center, 0 where missing, and, if
+    `with_gaps`, whether each reading is missing. Cells whose gamma is negligible are left out.
     """
     num_steps, num_cells = smoothed.shape
-    part = np.zeros((features.shape[1], num_cells), np.float32)
+    obs_dim, num_features = observations.shape[1], sums.shape[0]
+    width = -(-num_features // 7) * 7
+    features = np.zeros((min(256, num_steps), width), np.float32)
+    part = aligned_row(width * num_cells, _ZERO).reshape(width, num_cells)
     for start in range(0, num_steps, 256):  # float32 sums stay short
         stop = min(start + 256, num_steps)
-        for t in range(start, stop - 7, 8):
-            for f in range(features.shape[1]):
-                _add_eight(part[f], smoothed[t : t + 8], features[t : t + 8, f])
-        for t in range(stop - (stop - start) % 8, stop):
-            for f in range(features.shape[1]):
-                part[f] += smoothed[t] * features[t, f]
-        sums += part
-        part[:] = np.float32(0.0)
+        for t in range(start, stop):
+            features[t - start, 0] = _ONE
+            for d in range(obs_dim):
+                x = observations[t, d] - center[d]
+                is_missing = math.isnan(x)
+                x = 0.0 if is_missing else x
+                features[t - start, 1 + d] = x
+                features[t - start, 1 + obs_dim + d] = x * x
+                if with_gaps:
+                    features[t - start, 1 + 2 * obs_dim + d] = _ONE if is_missing else _ZERO
+        for first in range(start, stop, 16):
+            _add_outer(smoothed, first, min(first + 16, stop), features, start, part)
+        for f in range(num_features):
+            for c in range(num_cells):
+                sums[f, c] += part[f, c]
+        part[:] = _ZERO
 
 
-@njit(nogil=True, cache=True, fastmath=_FLAGS)
-def _add_eight(total, rows, factor):  # type: ignore[no-untyped-def]
-    """Do total += sum of eight rows, each times its factor."""
-    r0, r1, r2, r3, r4, r5, r6, r7 = (
-        rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
-    )  # fmt: skip
-    f0, f1, f2, f3 = factor[0], factor[1], factor[2], factor[3]
-    f4, f5, f6, f7 = factor[4], factor[5], factor[6], factor[7]
-    for c in range(total.shape[0]):
-        low = f0 * r0[c] + f1 * r1[c] + f2 * r2[c] + f3 * r3[c]
-        total[c] += low + (f4 * r4[c] + f5 * r5[c] + f6 * r6[c] + f7 * r7[c])
+@njit
+def _add_outer(smoothed, first, last, features, start, part):  # type: ignore[no-untyped-def]
+    """Do part += features transposed times smoothed over some steps, seven features a time."""
+    num_features, num_cells = part.shape
+    for c in range(0, num_cells, LANES):
+        top = broadcast(_ZERO)
+        for t in range(first, last):
+            top = maximum(load(smoothed, t * num_cells + c), top)
+        if not any_lane(greater(top, broadcast(_NEGLIGIBLE))):
+            continue
+        for f in range(0, num_features, 7):
+            i = f * num_cells + c
+            sum0, sum1 = load(part, i), load(part, i + num_cells)
+            sum2, sum3 = load(part, i + 2 * num_cells), load(part, i + 3 * num_cells)
+            sum4, sum5 = load(part, i + 4 * num_cells), load(part, i + 5 * num_cells)
+            sum6 = load(part, i + 6 * num_cells)
+            for t in range(first, last):
+                gamma = load(smoothed, t * num_cells + c)
+                j = (t - start) * num_features + f
+                sum0 += gamma * load_one(features, j)
+                sum1 += gamma * load_one(features, j + 1)
+                sum2 += gamma * load_one(features, j + 2)
+                sum3 += gamma * load_one(features, j + 3)
+                sum4 += gamma * load_one(features, j + 4)
+                sum5 += gamma * load_one(features, j + 5)
+                sum6 += gamma * load_one(features, j + 6)
+            store(sum0, part, i)
+            store(sum1, part, i + num_cells)
+            store(sum2, part, i + 2 * num_cells)
+            store(sum3, part, i + 3 * num_cells)
+            store(sum4, part, i + 4 * num_cells)
+            store(sum5, part, i + 5 * num_cells)
+            store(sum6, part, i + 6 * num_cells)
+
+
+@njit(nogil=True, cache=True)
+def filter_row(  # type: ignore[no-untyped-def]
+    mantissa, exponent, b, b_exponent, shift, weight, weight_exponent, jump, row, row_exponent, out
+):
+    """One step of eq. 3 in place, with a share of the belief spread evenly over all nodes.
+
+    mantissa, exponent (2 G,): the belief; b, b_exponent (1, G); row, row_exponent, out (1, G).
+    jump: what each node gets of the spread share, relative to the rest of the belief; with 0 the
+    step is `message_rows`'. `out` becomes the belief as probabilities.
+    Returns log2 of the step's sum and the belief's sum before it, whose ratio is the evidence.
+    """
+    num_cells = out.shape[1]
+    arriving = aligned_row(len(shift) * LANES, _ABSENT)
+    sums = broadcast(0.0)
+    for c in range(0, num_cells, LANES):
+        sums += widen(load(mantissa, c) * _power_of_two(load(exponent, c) + _BIAS))
+    before = add_lanes(sums)
+    jump_mantissa, jump_exponent = np.float32(0.0), _ABSENT
+    if jump > 0.0:
+        fraction, power = math.frexp(jump * before)
+        jump_mantissa, jump_exponent = np.float32(fraction), np.int32(power)
+    top_of_row = broadcast(_NOTHING)
+    for c in range(0, num_cells, LANES):
+        top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
+        if jump > 0.0:
+            higher = maximum(top, broadcast(jump_exponent))
+            total = total * _power_of_two(top - higher + _BIAS)
+            total += _power_of_two(broadcast(jump_exponent) - higher + _BIAS) * jump_mantissa
+            top = higher
+        value, own = _normalize(total * load(b, c), top + load(b_exponent, c))
+        store(value, row, c)
+        store(own, row_exponent, c)
+        top_of_row = maximum(own, top_of_row)
+    highest = largest(top_of_row)
+    if highest <= _ABSENT:
+        return -np.inf, before
+    _rebase(mantissa, exponent, highest, row, row_exponent, 0)
+    return _to_probabilities(row, row_exponent, 0, np.int32(0), out, 0) + highest, before
 
 
 @njit(nogil=True, cache=True)

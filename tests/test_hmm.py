@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from rfl_torch import inference
 from rfl_torch.hmm import MIN_LOG_PROB, GridHMM, Statistics
 
 EXACT_ATOL = 1e-12  # float64 against float64
@@ -409,3 +410,65 @@ def test_a_narrow_gaussian_far_from_zero_keeps_its_variance():
     hmm.m_step(hmm.e_step(observations), min_scale=1e-6)
     close(hmm.emission_mean[0], observations.mean(0), rtol=1e-9)
     close(hmm.emission_scale[0], observations.std(0, correction=0), rtol=1e-3)
+
+
+def test_the_criteria_count_what_em_is_free_to_choose():
+    hmm = random_hmm()
+    observations = draw(hmm, 50)
+    num_edges = int(hmm.successor_mask.sum())
+    free = (num_edges - 12) + 11 + 2 * hmm.emission_mean.numel()
+    assert hmm.num_free_parameters() == free
+    log_likelihood = hmm.log_likelihood(observations).item()
+    assert hmm.aic(observations) == pytest.approx(2 * free - 2 * log_likelihood)
+    assert hmm.bic([observations]) == pytest.approx(free * math.log(50) - 2 * log_likelihood)
+
+
+def test_a_parameter_to_be_fixed_must_exist():
+    hmm = random_hmm()
+    with pytest.raises(ValueError, match=r"`fixed` names \['mean'\]"):
+        hmm.m_step(hmm.e_step(draw(hmm, 5)), fixed=frozenset({"mean"}))
+
+
+def test_a_filter_stepped_online_is_the_filter_and_its_evidence_the_likelihood():
+    hmm = random_hmm()
+    observations = draw(hmm, 40)
+    filtered, chain = hmm.filter(observations), hmm.chain()
+    state = inference.start_filter(chain, filtered[0].numpy())
+    total = hmm.log_likelihood(observations[:1]).item()
+    for t in range(1, 40):
+        belief, evidence = inference.filter_step(chain, state, observations[t].numpy())
+        close(torch.from_numpy(belief), filtered[t], atol=POSTERIOR_ATOL)
+        total += evidence
+    assert total == pytest.approx(hmm.log_likelihood(observations).item(), abs=1e-4)
+
+
+@pytest.mark.parametrize("teleport", [1e-12, 0.01, 0.5])
+def test_a_filter_with_teleports_mixes_in_the_uniform_belief(teleport):
+    hmm = random_hmm()
+    observations = torch.cat([draw(hmm, 10), 50 + draw(hmm, 1), draw(hmm, 10)])
+    observations[5, 0] = torch.nan
+    chain, matrix = hmm.chain(), hmm.transition_matrix().detach()
+    state, belief = inference.start_filter(chain), torch.full((12,), 1 / 12).double()
+    for observation in observations:
+        predicted = (1 - teleport) * (belief @ matrix) + teleport / 12
+        log_rows = inference.log_emission(chain, observation[None].numpy())[0, chain.cell]
+        log_joint = predicted.log() + torch.from_numpy(log_rows)
+        belief = log_joint.softmax(0)
+        actual, evidence = inference.filter_step(chain, state, observation.numpy(), teleport)
+        close(torch.from_numpy(actual), belief, atol=POSTERIOR_ATOL)
+        assert evidence == pytest.approx(log_joint.logsumexp(0).item(), rel=1e-6, abs=1e-4)
+
+
+def test_the_online_filter_never_loses_a_node():
+    """A thousand frames of one place leave the others e**-10000 likely, and still possible."""
+    hmm = random_hmm()
+    with torch.no_grad():
+        hmm.emission_log_scale.fill_(math.log(0.05))
+    chain = hmm.chain()
+    state = inference.start_filter(chain)
+    here, there = hmm.emission_mean.detach()[[0, 11]].numpy()
+    for _ in range(1_000):
+        inference.filter_step(chain, state, here)
+    for _ in range(20):
+        belief, _ = inference.filter_step(chain, state, there)
+    assert belief.argmax() == 11

@@ -21,6 +21,15 @@ COUNT_ATOL = 1e-5  # sums of those over 1,000 steps; seen: 1e-6
 COUNT_RTOL = 1e-6  # float32 partial sums over 256 steps; seen: 2.5e-7
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """The definition's small steps wait for a second thread longer than they take."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
+
+
 def random_hmm(shape, obs_dim, seed, *, scale=0.1, spread=2.0, drop=0.0, **graph):
     """A model with nothing equal: transitions, start, means and scales are drawn."""
     generator = torch.Generator().manual_seed(seed)
@@ -335,6 +344,7 @@ def test_block_boundaries_change_nothing(block, monkeypatch):
 
 def test_a_log_longer_than_two_blocks_is_treated_as_one_sequence(monkeypatch):
     hmm = random_hmm((3, 3), 1, 12)
+    monkeypatch.setattr(inference, "BLOCK", 4096)
     num_steps = 2 * inference.BLOCK + 1_001  # each half needs two blocks
     observations = hmm.sample(num_steps, torch.Generator().manual_seed(4)).observations
     cut = hmm.e_step(observations), hmm.smooth(observations), hmm.log_likelihood(observations)

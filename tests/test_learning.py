@@ -1,6 +1,7 @@
 """`rfl_torch.learning`: the schedule as section 2.2 has it, and that learning learns."""
 
 import copy
+import itertools
 import math
 
 import pytest
@@ -242,15 +243,107 @@ def test_the_papers_schedule_has_200_iterations_at_each_of_its_rates():
         assert (stage.pseudo_count, stage.min_scale) == (0.0, 0.01)
 
 
-def test_a_stage_taken_up_midway_goes_on_as_if_it_had_never_stopped():
+@pytest.mark.parametrize("cut_after", [1, 5, 9])
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
+def test_a_stage_taken_up_midway_goes_on_as_if_it_had_never_stopped(cut_after, tolerance):
     observations = draw(ring_hmm(), 100)
-    stage = Stage(1, 12, temperature=(0.1, 1.0), trace=True, tolerance=0.0)
+    stage = Stage(1, 30, temperature=(0.5, 1.0), trace=tolerance == 0.0, tolerance=tolerance)
     whole, cut = ring_hmm(0.2), ring_hmm(0.2)
     record = [p for _, p in learning.run_stage(whole, [observations], stage)]
-    assert len(record) == 12
+    history = []
     for _, progress in learning.run_stage(cut, [observations], stage):
-        if progress.iteration == 4:
+        history.append(progress)
+        if progress.iteration == cut_after:
             break
-    for _, _ in learning.run_stage(cut, [observations], stage, first=5):
-        pass
+    rest = learning.run_stage(cut, [observations], stage, history=history)
+    history += [progress for _, progress in rest]
     assert is_equal(state(whole), state(cut))
+    assert [p.iteration for p in history] == [p.iteration for p in record]
+
+
+@pytest.mark.parametrize("cut_after", [3, 6, 9])
+def test_a_schedule_taken_up_midway_goes_on_as_if_it_had_never_stopped(cut_after):
+    observations, stages = draw(ring_hmm(), 200), (Stage(2, 6, trace=True), Stage(1, 5))
+    whole, cut = ring_hmm(0.2), ring_hmm(0.2)
+    record = learning.learn(whole, [observations], stages)
+
+    class Stop(Exception):  # noqa: N818
+        pass
+
+    class Crash(Recorder):
+        def on_iteration(self, hmm, statistics, progress):
+            super().on_iteration(hmm, statistics, progress)
+            if len(self.progress) == cut_after:
+                raise Stop
+
+    crash = Crash()
+    with pytest.raises(Stop):
+        learning.learn(cut, [observations], stages, crash)
+    resumed = learning.learn(cut, [observations], stages, record=crash.progress)
+    assert is_equal(state(whole), state(cut))
+    assert [(p.stage, p.iteration) for p in resumed] == [(p.stage, p.iteration) for p in record]
+
+
+def test_a_falling_likelihood_is_an_error_where_only_em_is_at_work():
+    def run(**options):
+        hmm, observations = ring_hmm(), draw(ring_hmm(), 100)
+        for _, progress in learning.run_stage(hmm, [observations], Stage(1, 6, **options)):
+            if progress.iteration == 2:  # somebody spoils the model
+                with torch.no_grad():
+                    hmm.emission_mean += 0.2
+        return progress
+
+    with pytest.raises(RuntimeError, match=r"fell from .* iteration 3, which EM cannot do"):
+        run()
+    for explained in ({"trace": True}, {"pseudo_count": 1.0}, {"temperature": (0.5, 1.0)}):
+        assert run(**explained).iteration == 5
+
+
+@pytest.mark.parametrize("min_scale", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize("temperature", [0.2, 1.0])
+def test_plain_em_never_lowers_the_likelihood_floor_or_not(min_scale, temperature):
+    hmm, observations = ring_hmm(0.05), draw(ring_hmm(), 300)
+    stage = Stage(1, 40, (temperature, temperature), min_scale=min_scale, tolerance=-math.inf)
+    record = learning.learn(hmm, [observations], (stage,))
+    course = [p.log_likelihood_per_step for p in record]
+    first = 1 if min_scale > 0.05 else 0  # the start was under the floor
+    assert all(b >= a - 1e-6 for a, b in itertools.pairwise(course[first:]))
+
+
+def test_of_several_restarts_the_best_on_held_out_data_is_kept():
+    truth = ring_hmm()
+    training, held_out = draw(truth, 200, seed=1), draw(truth, 200, seed=2)
+    hmm = GridHMM((1, 8), 2, radius=1.0, boundary="torus")
+    stages = (Stage(1, 15, temperature=(0.05, 1.0), pseudo_count=0.1),)
+    runs = learning.learn_restarts(hmm, [training], [held_out], stages, range(3))
+    assert [run.seed for run in runs] == [0, 1, 2]
+    best = max(run.held_out_per_step for run in runs)
+    assert best > min(run.held_out_per_step for run in runs)
+    assert per_step(hmm, held_out) == pytest.approx(best, abs=1e-12)
+    with pytest.raises(ValueError, match="no seed"):
+        learning.learn_restarts(hmm, [training], [held_out], stages, [])
+
+
+def test_a_partial_fit_with_full_memory_is_em_on_the_pooled_statistics():
+    hmm, logs = ring_hmm(), [draw(ring_hmm(), 60, seed) for seed in range(2)]
+    pooled = copy.deepcopy(hmm)
+    first = hmm.e_step(logs[0])
+    memory = learning.partial_fit(hmm, logs[0], pseudo_count=0.1)
+    second = hmm.e_step(logs[1])
+    memory = learning.partial_fit(hmm, logs[1], memory, pseudo_count=0.1)
+    pooled.m_step(first + second, pseudo_count=0.1)
+    assert is_equal(state(hmm), state(pooled))
+    assert memory.num_steps == 120
+
+
+def test_a_partial_fit_that_forgets_follows_a_changed_world():
+    hmm, moved = ring_hmm(), ring_hmm()
+    with torch.no_grad():
+        moved.emission_mean += 0.05
+    memory = learning.partial_fit(hmm, draw(ring_hmm(), 400))
+    for seed in range(12):
+        memory = learning.partial_fit(hmm, draw(moved, 100, seed), memory, forgetting=0.5)
+    assert memory.num_steps < 201
+    torch.testing.assert_close(hmm.emission_mean, moved.emission_mean, rtol=0.0, atol=0.03)
+    with pytest.raises(ValueError, match=r"forgetting is 1\.5"):
+        learning.partial_fit(hmm, draw(moved, 10), memory, forgetting=1.5)

@@ -1,0 +1,74 @@
+"""`experiments.benchmark`: that its tables say what was run, not how fast this machine is."""
+
+import importlib.util
+import os
+
+import pytest
+import torch
+
+from experiments import benchmark
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """A job of a moment, on the processor cores that the tests had before."""
+    monkeypatch.setattr(benchmark, "NUM_STEPS", 60)
+    monkeypatch.setattr(benchmark, "SHAPE", (4, 4))
+    cores, threads = os.sched_getaffinity(0), torch.get_num_threads()
+    yield
+    os.sched_setaffinity(0, cores)
+    torch.set_num_threads(threads)
+
+
+def test_the_log_is_seeded_noisy_and_follows_a_walk():
+    log = benchmark.make_log(500, seed=1)
+    assert log.shape == (500, 24)
+    assert torch.equal(log, benchmark.make_log(500, seed=1))
+    assert not torch.equal(log, benchmark.make_log(500, seed=2))
+    assert -0.1 < log.min() < log.max() < 1.1
+    assert log.diff(dim=0).abs().mean() < 0.3 * log.std(0).mean()  # neighbours look alike
+
+
+def test_every_timed_iteration_starts_from_the_same_model():
+    job = benchmark.make_job(60, (4, 4), 0)
+    work = benchmark.iterate(job)
+    first, second = work(), work()
+    assert torch.equal(first.log_likelihood, second.log_likelihood)
+
+
+def test_the_plain_loop_takes_the_jobs_arrays():
+    assert benchmark.run_torch_loop(benchmark.make_job(30, (4, 4), 0)) > 0
+
+
+def test_a_library_that_is_not_installed_is_left_out_with_a_note(monkeypatch, capsys):
+    peers = {"nothing": ("no_such_package", benchmark.run_hmmlearn)}
+    monkeypatch.setattr(benchmark, "PEERS", peers)
+    benchmark.print_peers(benchmark.Em(peer_steps=30))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines if "nothing" in line] == [
+        ["nothing", "not", "installed"]
+    ]
+
+
+@pytest.mark.parametrize("name", [n for n, (p, _) in benchmark.PEERS.items() if p != "torch"])
+def test_an_installed_library_runs_on_the_same_arrays(name):
+    package, _ = benchmark.PEERS[name]
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    assert benchmark.time_peer(name, benchmark.Em(peer_steps=20)) > 0
+
+
+def test_online_times_a_step_of_an_agent_that_keeps_all_its_nodes(capsys):
+    benchmark.main(benchmark.Online(num_steps=300, sides=(4,)))
+    out = capsys.readouterr().out
+    assert "filter step, N = 16" in out
+    assert "Executor.act, N = 16" in out
+
+
+def test_em_times_the_engine_against_two_matrix_products(monkeypatch, capsys):
+    monkeypatch.setattr(benchmark, "PEERS", {})
+    monkeypatch.setattr(benchmark, "print_scaling", lambda config: None)
+    benchmark.main(benchmark.Em(peer_steps=30))
+    lines = capsys.readouterr().out.splitlines()
+    products = next(line for line in lines if line.startswith("two float32"))
+    assert products.split()[-1] == "1.00"
