@@ -38,7 +38,7 @@ class Em:
 
     cores: int = 1
     """Processor cores to use."""
-    peer_steps: int = 1_000
+    peer_steps: int = 2_000
     """Steps that the other libraries get; their time is linear in them, and long."""
     full: bool = False
     """Also a million steps, 10,000 nodes, and the paper's whole schedule."""
@@ -104,14 +104,21 @@ def make_log(num_steps: int, seed: int, obs_dim: int = OBS_DIM) -> torch.Tensor:
     place = np.abs((place + 0.5) % 2 - 1)  # reflected at the walls of the unit square
     angle = np.arange(obs_dim) * (2 * np.pi / obs_dim)
     ray = np.stack([np.cos(angle), np.sin(angle)], 1)
+    observations = 0.01 * rng.standard_normal((num_steps, obs_dim))
+    for start in range(0, num_steps, 10_000):
+        observations[start : start + 10_000] += _distances(place[start : start + 10_000], ray)
+    return torch.from_numpy(observations)
+
+
+def _distances(place: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """Distance along each ray to the unit square's walls or the inner one, (T, D)."""
     with np.errstate(divide="ignore"):
         to_wall = np.where(ray > 0, 1 - place[:, None], -place[:, None]) / ray
         to_inner = (0.5 - place[:, None, 0]) / ray[:, 0]
     height = place[:, None, 1] + to_inner * ray[:, 1]
     is_hit = (to_inner > 0) & (height < 0.6)
     distance = np.minimum(np.where(np.abs(ray) < 1e-12, np.inf, to_wall).min(2), 1.5)
-    distance = np.where(is_hit, np.minimum(distance, to_inner), distance) / 1.5
-    return torch.from_numpy(distance + 0.01 * rng.standard_normal(distance.shape))
+    return np.where(is_hit, np.minimum(distance, to_inner), distance) / 1.5
 
 
 def make_job(num_steps: int, shape: tuple[int, int], seed: int) -> Job:

@@ -27,8 +27,10 @@ Status = Literal["running", "reached", "gave_up"]
 BLAME_LIMIT = 100.0
 """An edge costs at most so many times what the map says: costs must still add up in float64."""
 
-KICK = 3
-"""Innate actions after an aborted or a null plan: enough to leave a standstill, not the map."""
+KICK = 20
+"""Innate actions after an aborted or a null plan, or the next plan fails where this one did.
+Measured on three logs: 3 leave the robot stuck (53 % believed on the worst), 40 take it off the
+map (45 %), 20 do neither (63 %, 98 %, 97 %)."""
 
 
 class PathExecutor:
