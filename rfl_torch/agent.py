@@ -394,7 +394,10 @@ def make_bank(kind: str, num_nodes: int, obs_dim: int, action_dim: int) -> Bank:
     if kind == "mlp":
         return MLPBank(num_nodes, obs_dim, action_dim)
     if kind == "svr":
-        return SVRBank(num_nodes, 2 * obs_dim, action_dim, bandwidth=0.5)
+        # The paper names neither. Goals lie 4-8 steps outside a node's samples: narrower kernels
+        # and softer fits answer with the bias there. Believed success on two logs, two draws each:
+        # 0.5, 10 give 70, 64, 83, 19 %; these give 92, 85, 88, 83 %.
+        return SVRBank(num_nodes, 2 * obs_dim, action_dim, bandwidth=1.0, cost=100.0)
     return RBFBank(num_nodes, obs_dim, action_dim)
 
 
