@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -344,8 +343,3 @@ def prune(hmm: GridHMM, sequences: list[Tensor], temperature: float = 1.0) -> No
 def paper_stages(strides: tuple[int, ...] = (10, 5, 2, 1)) -> tuple[Stage, ...]:
     """The paper's schedule: 200 iterations at each rate, trace rule, floor 0.01."""
     return tuple(Stage(stride, 200, trace=True) for stride in strides)
-
-
-def to_sequences(logs: list[np.ndarray]) -> list[Tensor]:
-    """Observation arrays as float64 tensors."""
-    return [torch.from_numpy(np.asarray(log, np.float64)) for log in logs]
