@@ -54,6 +54,14 @@ class Statistics:
     log_likelihood: Tensor
     num_steps: float
 
+    @classmethod
+    def zeros(cls, hmm: "GridHMM") -> "Statistics":
+        """Nothing seen yet by a model of these shapes."""
+        node, reading = (torch.zeros_like(x) for x in (hmm.initial_logits, hmm.emission_mean))
+        edge = torch.zeros_like(hmm.transition_logits)
+        none = torch.zeros((), dtype=torch.float64)
+        return cls(node, node, edge, reading, reading, reading, none, 0.0)
+
     def __add__(self, other: "Statistics") -> "Statistics":
         """Pool the statistics of two sets of sequences under one model."""
         names = [field.name for field in fields(self)]
@@ -365,14 +373,37 @@ class GridHMM(nn.Module):
         for name, parameter in list(self.named_parameters()):
             setattr(self, name, nn.Parameter(parameter[kept]))
 
+    def replace_graph(
+        self,
+        successor: Tensor,
+        mask: Tensor,
+        cell: Tensor,
+        transition_logits: Tensor,
+        emission_mean: Tensor,
+        emission_log_scale: Tensor,
+    ) -> None:
+        """Take over other nodes and edges, which need not lie on the lattice.
+
+        Shapes are those of the parameters and buffers. Cells are distinct numbers from 0 to N - 1,
+        near for neighbours: the recursions' cost grows with the number of distinct differences
+        between joined cells.
+        """
+        self.num_cells = len(cell)
+        self._set_graph(successor, mask, cell)
+        self.transition_logits = nn.Parameter(transition_logits)
+        self.initial_logits = nn.Parameter(torch.zeros(len(cell), dtype=torch.float64))
+        self.emission_mean = nn.Parameter(emission_mean)
+        self.emission_log_scale = nn.Parameter(emission_log_scale)
+
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take over the `state_dict` of a model of the same lattice, pruned or not.
+        """Take over the `state_dict` of another model, on its lattice, pruned, or rebuilt.
 
         Raises:
             ValueError: if the tensors don't fit together or contradict the lattice.
         """
         successor, mask, cell = state["successor"], state["successor_mask"], state["cell"]
-        num_nodes, width = len(cell), self.successor.shape[1]
+        num_nodes, width = successor.shape
+        num_cells = max(self.num_cells, num_nodes)
         shapes = {
             "successor": (num_nodes, width),
             "successor_mask": (num_nodes, width),
@@ -384,13 +415,14 @@ class GridHMM(nn.Module):
         for name, shape in shapes.items():
             if tuple(state[name].shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(state[name].shape)}, needs {shape}")
-        in_lattice = (cell >= 0) & (cell < self.num_cells)
-        if not in_lattice.all() or len(cell.unique()) != num_nodes or mask.dtype != torch.bool:
-            raise ValueError(f"cells must be distinct and lie in 0..{self.num_cells - 1}")
+        is_cell = (cell >= 0) & (cell < num_cells)
+        if not is_cell.all() or len(cell.unique()) != num_nodes or mask.dtype != torch.bool:
+            raise ValueError(f"cells must be distinct and lie in 0..{num_cells - 1}")
         if not ((successor >= 0) & (successor < num_nodes)).all() or not mask.any(1).all():
             raise ValueError(f"successors must lie in 0..{num_nodes - 1}, one for each node")
         if not all(state[name].isfinite().all() for name, _ in self.named_parameters()):
             raise ValueError("parameters must be finite")
+        self.num_cells = num_cells
         self._set_graph(successor, mask, cell)
         for name, _ in list(self.named_parameters()):
             setattr(self, name, nn.Parameter(state[name]))
