@@ -27,6 +27,7 @@ import tyro
 from experiments import cli
 from rfl_torch import Agent, AgentConfig, Trajectory, inference, learning
 from rfl_torch.hmm import GridHMM, Statistics
+from rfl_torch.planner import largest_component
 
 NUM_STEPS, SHAPE, OBS_DIM = 10_000, (20, 20), 24
 """The job that the table's ratios stand for: the paper's maze."""
@@ -48,7 +49,7 @@ class Em:
 
 @dataclass(frozen=True)
 class Online:
-    """Acting: one step of the filter, and `Executor.act`."""
+    """Acting on a map that is laid out, not learned: a step of the filter, and `Executor.act`."""
 
     cores: int = 1
     """Processor cores to use."""
@@ -98,16 +99,24 @@ def use_cores(count: int) -> None:
 def make_log(num_steps: int, seed: int, obs_dim: int = OBS_DIM) -> torch.Tensor:
     """Rays of a random walk in a room with an inner wall, in [0, 1], noise 0.01; (T, D)."""
     rng = np.random.default_rng(seed)
-    heading = np.cumsum(0.3 * rng.standard_normal(num_steps))
-    step = 0.02 * np.stack([np.cos(heading), np.sin(heading)], 1)
-    place = np.cumsum(step, 0)
-    place = np.abs((place + 0.5) % 2 - 1)  # reflected at the walls of the unit square
-    angle = np.arange(obs_dim) * (2 * np.pi / obs_dim)
-    ray = np.stack([np.cos(angle), np.sin(angle)], 1)
+    place = _walk(num_steps, rng)
     observations = 0.01 * rng.standard_normal((num_steps, obs_dim))
     for start in range(0, num_steps, 10_000):
-        observations[start : start + 10_000] += _distances(place[start : start + 10_000], ray)
+        observations[start : start + 10_000] += _rays(place[start : start + 10_000], obs_dim)
     return torch.from_numpy(observations)
+
+
+def _walk(num_steps: int, rng: np.random.Generator) -> np.ndarray:
+    """Places in the unit square, 0.02 apart, (T, 2)."""
+    heading = np.cumsum(0.3 * rng.standard_normal(num_steps))
+    place = np.cumsum(0.02 * np.stack([np.cos(heading), np.sin(heading)], 1), 0)
+    return np.abs((place + 0.5) % 2 - 1)  # reflected at the walls
+
+
+def _rays(place: np.ndarray, obs_dim: int = OBS_DIM) -> np.ndarray:
+    """What is seen from places (T, 2) without noise, (T, D)."""
+    angle = np.arange(obs_dim) * (2 * np.pi / obs_dim)
+    return _distances(place, np.stack([np.cos(angle), np.sin(angle)], 1))
 
 
 def _distances(place: np.ndarray, ray: np.ndarray) -> np.ndarray:
@@ -440,48 +449,74 @@ def benchmark_online(config: Online) -> None:
     cli.check_count("num-steps", config.num_steps)
     rows = []
     for side in config.sides:
-        agent, log = make_agent(side, config.num_steps, config.seed)
-        observations = torch.from_numpy(agent.normalize(log.observations))
+        begin = time.perf_counter()
+        agent = make_agent(side, max(2_000, 4 * side**2), config.seed)
+        print(f"{agent.num_nodes} nodes: set up in {time.perf_counter() - begin:.1f} s")
         for name, seconds in (
-            ("filter step", filter_times(agent, observations)),
-            ("Executor.act", act_times(agent, log)),
+            ("filter step", filter_times(agent, config.num_steps, config.seed)),
+            ("Executor.act", act_times(agent, config.num_steps, config.seed)),
         ):
             rows.append([f"{name}, N = {side**2}", *microseconds(seconds)])
     print(cli.table(["one control step", "median us", "99 % us"], rows))
 
 
-def make_agent(side: int, num_steps: int, seed: int) -> tuple[Agent, Trajectory]:
-    """An agent whose map has as many nodes as the grid, and a log to drive it with."""
-    observations = make_log(num_steps + 1, seed).float().numpy()
-    actions = np.diff(observations[:, :2], axis=0).astype(np.float32)
+def make_agent(side: int, num_steps: int, seed: int) -> Agent:
+    """An agent whose map is known: a node at every place of a lattice over the room.
+
+    It learns controllers and edges from a walk of `num_steps`, as it would after EM.
+    """
+    rng = np.random.default_rng(seed)
+    place = _walk(num_steps + 1, rng)
+    actions = np.diff(place, axis=0).astype(np.float32)
     bound = np.full(2, np.abs(actions).max(), np.float32)
-    log = Trajectory(observations, actions, action_low=-bound, action_high=bound)
-    stages = (learning.Stage(1, 2, (0.1, 0.1), pseudo_count=1.0, min_scale=0.05),)
-    agent = Agent(replace(AgentConfig(), shape=(side, side), stages=stages), seed=seed)
-    with mock.patch.object(learning, "prune"):  # all nodes are to stay
-        return agent.fit(log), log
+    log = Trajectory(_see(place, rng), actions, action_low=-bound, action_high=bound)
+    agent = Agent(replace(AgentConfig(), shape=(side, side)), seed=seed)
+    nodes = (np.indices((side, side)).reshape(2, -1).T + 0.5) / side
+
+    @torch.no_grad()
+    def lay_out(hmm: GridHMM, *_: object) -> list[learning.Progress]:
+        hmm.emission_mean.copy_(torch.from_numpy(agent.normalize(_rays(nodes))))
+        hmm.emission_log_scale.fill_(math.log(math.hypot(0.01, 0.25 / side)))
+        hmm.transition_logits.zero_()
+        return []
+
+    with mock.patch.object(learning, "learn", lay_out), mock.patch.object(learning, "prune"):
+        return agent.fit(log)
 
 
-def filter_times(agent: Agent, observations: torch.Tensor) -> list[float]:
+def _see(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Noisy observations from places (T, 2), float32 (T, D)."""
+    noise = 0.01 * rng.standard_normal((len(place), OBS_DIM))
+    return (_rays(place) + noise).astype(np.float32)
+
+
+def filter_times(agent: Agent, num_steps: int, seed: int) -> list[float]:
     """Seconds of each step of the filter alone."""
     chain = agent.hmm.chain()
     state, seconds = inference.start_filter(chain), []
-    for observation in observations.double().numpy():
-        begin = time.perf_counter()
+    for observation in agent.normalize(make_log(num_steps, seed).numpy()):
+        begin = clock()
         inference.filter_step(chain, state, observation, 0.01)
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(clock() - begin)
     return seconds
 
 
-def act_times(agent: Agent, log: Trajectory) -> list[float]:
-    """Seconds of each `Executor.act` on the way to a node."""
-    executor, seconds = agent.executor(agent.num_nodes // 2), []
-    for observation in log.observations:
-        begin = time.perf_counter()
-        executor.act(observation)
-        seconds.append(time.perf_counter() - begin)
+def act_times(agent: Agent, num_steps: int, seed: int) -> list[float]:
+    """Seconds of each `Executor.act` of a point robot that drives from one node to the next."""
+    rng = np.random.default_rng(seed)
+    goals = np.flatnonzero(largest_component(agent.graph))
+    place, seconds, reached = np.full((1, 2), 0.5), [], 0
+    executor = agent.executor(int(rng.choice(goals)))
+    for _ in range(num_steps):
+        observation = _see(place, rng)[0]
+        begin = clock()
+        action = executor.act(observation)
+        seconds.append(clock() - begin)
+        place = np.clip(place + action, 0.01, 0.99)
         if executor.status != "running":
-            executor = agent.executor(len(seconds) % agent.num_nodes)
+            reached += executor.status == "reached"
+            executor = agent.executor(int(rng.choice(goals)))
+    print(f"{agent.num_nodes} nodes: the robot reached {reached} goals on the way")
     return seconds
 
 
