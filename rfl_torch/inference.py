@@ -8,6 +8,7 @@ block when it is crossed, so memory grows with T / BLOCK, not with T.
 Symbols as in `kernels`; equation numbers are the paper's.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -161,12 +162,16 @@ def _gaussians(chain: Chain) -> tuple[Any, ...]:
 
 
 class Rows(NamedTuple):
-    """A message and the emissions b_j(o_t) over some steps, in time order, all (T, G)."""
+    """A message and the emissions b_j(o_t) over some steps, in time order, all (T, G).
+
+    base: int64 (T,), the power of two that each step's message was divided by.
+    """
 
     mantissa: np.ndarray
     exponent: np.ndarray
     b: np.ndarray
     b_exponent: np.ndarray
+    base: np.ndarray
 
     def part(self, steps: slice) -> "Rows":
         """The rows of some of the steps."""
@@ -185,7 +190,8 @@ def _borrow_rows(num_steps: int, num_cells: int) -> Iterator[Rows]:
     arrays = (buffer[k * size : (k + 1) * size].reshape(num_steps, num_cells) for k in range(4))
     mantissa, exponent, b, b_exponent = arrays
     try:
-        yield Rows(mantissa.view(np.float32), exponent, b.view(np.float32), b_exponent)
+        base = np.empty(num_steps, np.int64)
+        yield Rows(mantissa.view(np.float32), exponent, b.view(np.float32), b_exponent, base)
     finally:
         if len(_spare) < 2 and buffer.nbytes <= _MAX_SPARE:
             _spare.append(buffer)
@@ -210,6 +216,7 @@ class _Message:
             aligned_full((2 * chain.num_cells,), 0.0, np.float32),
             aligned_full((2 * chain.num_cells,), 0, np.int32),
         )
+        self.normalizer = np.zeros(2)
 
     def parts(self, block: slice) -> Iterator[tuple[slice, slice]]:
         """Cut a block to fit the cache, in the message's order: steps, and steps in the block."""
@@ -231,14 +238,13 @@ class _Message:
         elif not self.is_forward and steps.stop == len(self.observations):
             log_base += self._begin(rows.part(slice(-1, None)))
             rows = rows.part(slice(0, -1))
-        base = np.empty(len(rows.b), np.int64)
         done = kernels.message_rows(
             *self.last, rows.b, rows.b_exponent, *self.edges,
-            rows.mantissa, rows.exponent, base, not self.is_forward,
+            rows.mantissa, rows.exponent, rows.base, not self.is_forward,
         )  # fmt: skip
         if not done:
             raise ValueError(_UNREACHABLE)
-        return float(log_base + base.sum() * np.log(2.0))
+        return float(log_base + rows.base.sum() * np.log(2.0))
 
     def _begin(self, row: Rows) -> float:
         """Write alpha_1 = pi b_1 (eq. 2), or b_T beta_T with beta_T = 1 (eq. 4); returns a base."""
@@ -250,14 +256,26 @@ class _Message:
         self.last[1][:] = np.tile(row.exponent[0], 2)
         return float(base)
 
+    def meet(self, other: Rows) -> float:
+        """Begin to cross, at a row (1, G) of the other message; log2 of the two's joint sum."""
+        kernels.joint_sum(
+            *self.last, other.mantissa, other.exponent, *self.edges, self.normalizer
+        )  # fmt: skip
+        if self.normalizer[0] == 0.0:  # the two halves share no live node
+            raise ValueError(_UNREACHABLE)
+        return float(np.log2(self.normalizer[0]) + self.normalizer[1])
+
     def cross(
         self, other: Rows, smoothed: np.ndarray, counts: np.ndarray, counts_first_step: bool
-    ) -> float:
+    ) -> None:
         """Push the message across steps whose other message is known; see `crossing_rows`."""
-        return kernels.crossing_rows(
-            *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, *self.edges,
-            smoothed, counts, counts_first_step, not self.is_forward,
+        kernels.crossing_rows(
+            *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, other.base,
+            *self.edges, self.normalizer, smoothed, counts, counts_first_step,
+            not self.is_forward,
         )  # fmt: skip
+        if not 0.0 < self.normalizer[0] < np.inf:  # the messages part within the steps
+            raise ValueError(_UNREACHABLE)
 
 
 class _Half:
@@ -371,19 +389,35 @@ def _meet_in_the_middle(  # type: ignore[no-untyped-def]
     with (
         _borrow_rows(block, chain.num_cells) as past_rows,
         _borrow_rows(block, chain.num_cells) as future_rows,
-        ThreadPoolExecutor(2) as pool,
     ):
-        past, future = pool.map(
+        past, future = _both(
             _Half,
-            (forward, backward),
-            (slice(0, middle), slice(middle, num_steps)),
-            (past_rows, future_rows),
+            (forward, slice(0, middle), past_rows),
+            (backward, slice(middle, num_steps), future_rows),
         )
-        (edge_in, _, log2_joint), (edge_out, initial, _) = pool.map(
-            _cross_half, (forward, backward), (future, past), (visit, visit)
+        (edge_in, _, log2_joint), (edge_out, initial, _) = _both(
+            _cross_half, (forward, future, visit), (backward, past, visit)
         )
     log_likelihood = log2_joint * np.log(2.0) + past.log_base + future.log_base
     return np.stack([edge_in, edge_out]), initial, log_likelihood
+
+
+def _both(  # type: ignore[no-untyped-def]
+    work: Callable[..., Any], first: tuple[Any, ...], second: tuple[Any, ...]
+):
+    """Do two pieces of work, at once where the process has two cores; returns both results."""
+    if _num_cores() == 1:
+        return work(*first), work(*second)
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(work, *second)
+        return work(*first), other.result()
+
+
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[no-untyped-def]
@@ -393,13 +427,13 @@ def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[n
     smoothed, log2_joint = buffer, None
     for block in half.from_middle():
         for steps, own in message.parts(block):
-            smoothed = buffer[: steps.stop - steps.start]
+            rows, smoothed = half.rows.part(own), buffer[: steps.stop - steps.start]
             # Both messages take the step over the middle; the forward one counts it.
             is_counted = message.is_forward or log2_joint is not None
-            first = message.cross(half.rows.part(own), smoothed, counts, is_counted)
-            if first == -np.inf:  # the two halves share no live node
-                raise ValueError(_UNREACHABLE)
-            log2_joint = first if log2_joint is None else log2_joint
+            if log2_joint is None:
+                nearest = slice(0, 1) if message.is_forward else slice(-1, None)
+                log2_joint = message.meet(rows.part(nearest))
+            message.cross(rows, smoothed, counts, is_counted)
             visit(int(message.is_forward), steps, smoothed)
     return counts, smoothed[0].astype(np.float64), log2_joint
 
@@ -458,7 +492,9 @@ def start_filter(chain: Chain, belief: np.ndarray | None = None) -> FilterState:
     if belief is not None:
         log_row[chain.cell] = np.log(np.maximum(belief, 1e-300))
     dtypes = (np.float32, np.int32, np.float32, np.int32)
-    rows = Rows(*(aligned_full((1, num_cells), 0, dtype) for dtype in dtypes))
+    rows = Rows(
+        *(aligned_full((1, num_cells), 0, dtype) for dtype in dtypes), np.zeros(1, np.int64)
+    )
     kernels.split_row(log_row[None], rows.mantissa, rows.exponent)
     mantissa, exponent = (
         aligned_full((2 * num_cells,), 0, dtype) for dtype in (np.float32, np.int32)

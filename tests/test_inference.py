@@ -466,9 +466,13 @@ def test_a_jump_past_the_exponents_range_is_an_error_wherever_it_falls(num_steps
             method(observations)
 
 
-def test_two_threads_give_the_same_bits_every_time():
+@pytest.mark.parametrize("cores", [(2, 2), (1, 2)])
+def test_one_thread_and_two_give_the_same_bits_every_time(cores, monkeypatch):
     hmm = map_hmm()
     observations = map_data("held-out", hmm)
-    first, again = hmm.e_step(observations), hmm.e_step(observations)
+    monkeypatch.setattr(inference, "_num_cores", lambda: cores[0])
+    first = hmm.e_step(observations)
+    monkeypatch.setattr(inference, "_num_cores", lambda: cores[1])
+    again = hmm.e_step(observations)
     for name in ("initial", "node", "edge", "weight", "first", "second", "log_likelihood"):
         assert torch.equal(getattr(first, name), getattr(again, name))
