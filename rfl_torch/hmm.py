@@ -207,7 +207,7 @@ class GridHMM(nn.Module):
     def _expect(self, chain: inference.Chain, sequence: np.ndarray) -> Statistics:
         found = inference.expectations(chain, self._diagonals, sequence)
         edge = torch.zeros(self.successor.shape, dtype=torch.float64)
-        edge[self._diagonals.edge[:, 0], self._diagonals.edge[:, 1]] = torch.from_numpy(found.edge)
+        edge.numpy().ravel()[self._diagonals.slot] = found.edge
         return Statistics(
             torch.from_numpy(found.initial),
             torch.from_numpy(found.node),

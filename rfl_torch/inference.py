@@ -19,17 +19,17 @@ import numpy as np
 from rfl_torch import kernels
 from rfl_torch.simd import LANES, aligned_empty, aligned_full
 
-BLOCK = 32768
+BLOCK = 50_000
 """Steps whose messages are held at once by each of the two threads, 16 bytes a node; of longer
 halves all but the last block are run twice, which takes half as long again."""
 
 _CACHE_BLOCK = 512
 """Steps that pass from one kernel to the next while they are in the cache."""
 
-_MAX_ENTRIES = 1 << 24
+_MAX_ENTRIES = 20_000_000
 """Steps times cells that a block holds at most, whatever BLOCK says; an entry takes 16 bytes."""
 
-_MAX_SPARE = 1 << 28
+_MAX_SPARE = 1 << 29
 """Bytes of one working buffer that are kept for the next call: fresh pages cost a tenth of it."""
 
 _UNREACHABLE = (
@@ -72,18 +72,16 @@ class Chain(NamedTuple):
 
 
 class Diagonals(NamedTuple):
-    """Structure of a graph by diagonal, made once: edge (i, k) stands at [diagonal[i, k], cell]."""
+    """Structure of a graph by diagonal, made once: where every edge stands in the tables."""
 
     shift: np.ndarray
     """int64 (O,), the distinct (target cell - source cell) mod G."""
-    edge: np.ndarray
-    """int64 (E, 2), the (node, k) of every edge."""
-    diagonal: np.ndarray
-    """int64 (E,), which shift the edge has."""
-    source: np.ndarray
-    """int64 (E,), its source cell."""
-    target: np.ndarray
-    """int64 (E,), its target cell."""
+    slot: np.ndarray
+    """int64 (E,), node * K + k, in a successor table (N, K) laid out flat."""
+    entering: np.ndarray
+    """int64 (E,), diagonal * G + target cell, in a table (O, G) laid out flat."""
+    leaving: np.ndarray
+    """int64 (E,), diagonal * G + source cell."""
 
 
 def build_diagonals(
@@ -91,11 +89,10 @@ def build_diagonals(
 ) -> Diagonals:
     """Sort the edges of a successor table (N, K) by the shift between their cells."""
     num_cells = _whole_tiles(num_cells)
-    edge = np.argwhere(mask)
-    source = cell[edge[:, 0]]
-    target = cell[successor[edge[:, 0], edge[:, 1]]]
+    slot = np.flatnonzero(mask)
+    source, target = cell[slot // mask.shape[1]], cell[successor.ravel()[slot]]
     shift, diagonal = np.unique((target - source) % num_cells, return_inverse=True)
-    return Diagonals(shift, edge, diagonal, source, target)
+    return Diagonals(shift, slot, diagonal * num_cells + target, diagonal * num_cells + source)
 
 
 def _whole_tiles(num_cells: int) -> int:
@@ -115,18 +112,18 @@ def build_chain(
     """Lay the parameters of N nodes out over the lattice; log_transition (N, K), mean (N, D)."""
     num_cells = _whole_tiles(num_cells)
     shape = (len(diagonals.shift), num_cells)
-    log_weight = log_transition[diagonals.edge[:, 0], diagonals.edge[:, 1]]
+    log_weight = log_transition.ravel()[diagonals.slot]
     log_weight_in = aligned_full(shape, -np.inf, np.float64)
-    log_weight_in[diagonals.diagonal, diagonals.target] = log_weight
-    log2_weight = log_weight / np.log(2.0)
+    log_weight_in.ravel()[diagonals.entering] = log_weight
+    log2_weight = log_weight * (1.0 / np.log(2.0))
     exponent = np.floor(log2_weight)
-    mantissa = np.exp2(log2_weight - exponent).astype(np.float32)
+    mantissa = np.exp2(log2_weight - exponent)
     tables = []
-    for column in (diagonals.target, diagonals.source):
+    for place in (diagonals.entering, diagonals.leaving):
         weight = aligned_full(shape, 0.0, np.float32)
         weight_exponent = aligned_full(shape, kernels.ABSENT, np.int32)
-        weight[diagonals.diagonal, column] = mantissa
-        weight_exponent[diagonals.diagonal, column] = exponent
+        weight.ravel()[place] = mantissa
+        weight_exponent.ravel()[place] = exponent
         tables += [weight, weight_exponent]
     inverse_scale, scaled_mean, log_norm = (
         aligned_full((mean.shape[1], num_cells), 0.0, np.float64) for _ in range(3)
@@ -265,17 +262,19 @@ class _Message:
             raise ValueError(_UNREACHABLE)
         return float(np.log2(self.normalizer[0]) + self.normalizer[1])
 
-    def cross(
-        self, other: Rows, smoothed: np.ndarray, counts: np.ndarray, counts_first_step: bool
-    ) -> None:
-        """Push the message across steps whose other message is known; see `crossing_rows`."""
+    def cross(self, other: Rows, counts: np.ndarray, counts_first_step: bool) -> np.ndarray:
+        """Push the message across steps whose other message is known; see `crossing_rows`.
+
+        Returns gamma (T, G), which takes the place of the other message's mantissas.
+        """
         kernels.crossing_rows(
             *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, other.base,
-            *self.edges, self.normalizer, smoothed, counts, counts_first_step,
+            *self.edges, self.normalizer, other.mantissa, counts, counts_first_step,
             not self.is_forward,
         )  # fmt: skip
         if not 0.0 < self.normalizer[0] < np.inf:  # the messages part within the steps
             raise ValueError(_UNREACHABLE)
+        return other.mantissa
 
 
 class _Half:
@@ -305,7 +304,7 @@ class Expectations(NamedTuple):
     """What the E-step gathers (eqs. 7-10), by node; sums over the steps of one sequence.
 
     initial (N,): gamma_1. node (N,): sum of gamma_t. edge (E,): sum of xi_t, in the order of
-    `Diagonals.edge`. weight, first, second (N, D): sums of gamma_t, gamma_t o_t and gamma_t o_t^2
+    `Diagonals.slot`. weight, first, second (N, D): sums of gamma_t, gamma_t o_t and gamma_t o_t^2
     over the readings that are not NaN. log_likelihood [nat].
     """
 
@@ -338,8 +337,7 @@ def expectations(chain: Chain, diagonals: Diagonals, observations: np.ndarray) -
     return Expectations(
         initial[chain.cell],
         node,
-        edge[0][diagonals.diagonal, diagonals.target]
-        + edge[1][diagonals.diagonal, diagonals.source],
+        edge[0].ravel()[diagonals.entering] + edge[1].ravel()[diagonals.leaving],
         weight,
         first + weight * center,
         second + 2 * center * first + weight * center**2,
@@ -423,17 +421,16 @@ def _num_cores() -> int:
 def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[no-untyped-def]
     """Carry `message` across the half that the other thread has stored."""
     counts = np.zeros(message.chain.weight_in.shape)
-    buffer = aligned_empty((_CACHE_BLOCK, message.chain.num_cells), np.float32)
-    smoothed, log2_joint = buffer, None
+    smoothed, log2_joint = half.rows.mantissa, None
     for block in half.from_middle():
         for steps, own in message.parts(block):
-            rows, smoothed = half.rows.part(own), buffer[: steps.stop - steps.start]
+            rows = half.rows.part(own)
             # Both messages take the step over the middle; the forward one counts it.
             is_counted = message.is_forward or log2_joint is not None
             if log2_joint is None:
                 nearest = slice(0, 1) if message.is_forward else slice(-1, None)
                 log2_joint = message.meet(rows.part(nearest))
-            message.cross(rows, smoothed, counts, is_counted)
+            smoothed = message.cross(rows, counts, is_counted)
             visit(int(message.is_forward), steps, smoothed)
     return counts, smoothed[0].astype(np.float64), log2_joint
 
@@ -491,10 +488,9 @@ def start_filter(chain: Chain, belief: np.ndarray | None = None) -> FilterState:
     log_row = chain.log_node.copy()
     if belief is not None:
         log_row[chain.cell] = np.log(np.maximum(belief, 1e-300))
-    dtypes = (np.float32, np.int32, np.float32, np.int32)
-    rows = Rows(
-        *(aligned_full((1, num_cells), 0, dtype) for dtype in dtypes), np.zeros(1, np.int64)
-    )
+    floats = [aligned_full((1, num_cells), 0.0, np.float32) for _ in range(2)]
+    integers = [aligned_full((1, num_cells), 0, np.int32) for _ in range(2)]
+    rows = Rows(floats[0], integers[0], floats[1], integers[1], np.zeros(1, np.int64))
     kernels.split_row(log_row[None], rows.mantissa, rows.exponent)
     mantissa, exponent = (
         aligned_full((2 * num_cells,), 0, dtype) for dtype in (np.float32, np.int32)

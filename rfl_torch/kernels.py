@@ -364,6 +364,7 @@ def crossing_rows(  # type: ignore[no-untyped-def]
     tile by tile; rows sum to one but for a step's rounding.
     other (T, G), other_base (T,): the stored rows. Forward: `other` = b_t beta_t rows and the
     emission enters after gamma is formed; backward: `other` = alpha_t rows, last row first.
+    smoothed (T, G): gamma; it may be `other` itself.
     normalizer: float64 (2,), from `joint_sum` before the first block, carried on from there.
     counts: float64 (O, G), added to, the block's first step only if `counts_first_step`.
     """
