@@ -3,6 +3,7 @@
 python -m experiments.benchmark em             one EM iteration against the other libraries
 python -m experiments.benchmark em --full      up to a million steps, and the paper's schedule
 python -m experiments.benchmark online         one control step, at 400 and at 10,000 nodes
+torchrun --standalone --nproc-per-node 2 -m experiments.benchmark fleet      what ranks cost
 
 Seconds are the process's own on one core, and by the wall on several; the best of some runs. A
 library that is not installed is left out with a note; `pip install rfl-torch[peers]` installs them.
@@ -25,7 +26,7 @@ import torch
 import tyro
 
 from experiments import cli
-from rfl_torch import Agent, AgentConfig, Trajectory, inference, learning
+from rfl_torch import Agent, AgentConfig, Trajectory, distributed, inference, learning
 from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.planner import largest_component
 
@@ -61,8 +62,22 @@ class Online:
     """Seed of the data."""
 
 
+@dataclass(frozen=True)
+class Fleet:
+    """Learning by several ranks under torchrun, a core each: the constants of docs/fleet.md."""
+
+    num_steps: int = 10_000
+    """Steps of each rank's log."""
+    sides: tuple[int, ...] = (20, 40)
+    """Sides of the square grids."""
+    seed: int = 0
+    """Seed of the data."""
+
+
 Config = (
-    Annotated[Em, tyro.conf.subcommand("em")] | Annotated[Online, tyro.conf.subcommand("online")]
+    Annotated[Em, tyro.conf.subcommand("em")]
+    | Annotated[Online, tyro.conf.subcommand("online")]
+    | Annotated[Fleet, tyro.conf.subcommand("fleet")]
 )
 
 
@@ -74,8 +89,11 @@ class Job:
     observations: torch.Tensor
 
 
-def main(config: Em | Online) -> None:
+def main(config: Em | Online | Fleet) -> None:
     """Run one of the benchmarks on so many cores."""
+    if isinstance(config, Fleet):
+        benchmark_fleet(config)
+        return
     cli.check_count("cores", config.cores)
     use_cores(config.cores)
     if isinstance(config, Em):
@@ -130,11 +148,11 @@ def _distances(place: np.ndarray, ray: np.ndarray) -> np.ndarray:
     return np.where(is_hit, np.minimum(distance, to_inner), distance) / 1.5
 
 
-def make_job(num_steps: int, shape: tuple[int, int], seed: int) -> Job:
+def make_job(num_steps: int, shape: tuple[int, int], seed: int, obs_dim: int = OBS_DIM) -> Job:
     """The log and a model whose means are random frames of it, shrunk half-way to 0.5."""
-    observations = make_log(num_steps, seed)
+    observations = make_log(num_steps, seed, obs_dim)
     generator = torch.Generator().manual_seed(seed)
-    hmm = GridHMM(shape, OBS_DIM)
+    hmm = GridHMM(shape, obs_dim)
     frames = torch.randint(num_steps, (hmm.num_nodes,), generator=generator)
     with torch.no_grad():
         hmm.emission_mean.copy_(0.5 * observations[frames] + 0.25)
@@ -418,19 +436,22 @@ def print_scaling(config: Em) -> None:
     rows = []
     for num_steps in [1_000, 10_000, 100_000] + ([1_000_000] if config.full else []):
         work = iterate(make_job(num_steps, SHAPE, config.seed))
-        rows.append(growth(num_steps, 400, best(work, 9 if num_steps <= 10_000 else 2)))
+        rows.append(growth(num_steps, 400, OBS_DIM, best(work, 9 if num_steps <= 10_000 else 2)))
     for side in [10, 20, 40] + ([100] if config.full else []):
-        work = iterate(make_job(2_000, (side, side), config.seed))
-        rows.append(growth(2_000, side**2, best(work, 5)))
+        work = iterate(make_job(NUM_STEPS, (side, side), config.seed))
+        rows.append(growth(NUM_STEPS, side**2, OBS_DIM, best(work, 9 if side <= 20 else 2)))
+    for obs_dim in (8, 48):
+        work = iterate(make_job(NUM_STEPS, SHAPE, config.seed, obs_dim))
+        rows.append(growth(NUM_STEPS, 400, obs_dim, best(work)))
     print(cli.table(["growth", "seconds", "ns per step and node"], rows))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"largest memory so far: {peak:.2f} GB\n")
 
 
-def growth(num_steps: int, num_nodes: int, seconds: float) -> list[str]:
+def growth(num_steps: int, num_nodes: int, obs_dim: int, seconds: float) -> list[str]:
     """A row of the table of growth."""
     each = 1e9 * seconds / (num_steps * num_nodes)
-    return [f"T = {num_steps}, N = {num_nodes}", f"{seconds:.3g}", f"{each:.1f}"]
+    return [f"T = {num_steps}, N = {num_nodes}, D = {obs_dim}", f"{seconds:.3g}", f"{each:.1f}"]
 
 
 def print_schedule(config: Em) -> None:
@@ -518,6 +539,51 @@ def act_times(agent: Agent, num_steps: int, seed: int) -> list[float]:
             executor = agent.executor(int(rng.choice(goals)))
     print(f"{agent.num_nodes} nodes: the robot reached {reached} goals on the way")
     return seconds
+
+
+def benchmark_fleet(config: Fleet) -> None:
+    """Print what an iteration costs each rank, and what the sum over the ranks adds."""
+    global clock
+    cli.check_count("num-steps", config.num_steps)
+    clock = time.perf_counter  # a rank that waits takes time too
+    torch.set_num_threads(1)
+    with distributed.job() as rank:
+        if hasattr(os, "sched_setaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
+            os.sched_setaffinity(0, {cores[rank.index % len(cores)]})
+        rows = [fleet_row(config, side, rank) for side in config.sides]
+        nothing = best(lambda: distributed.add_up(torch.zeros(1)), 50)
+    if rank.index == 0:
+        header = [
+            f"{rank.count} rank(s), T = {config.num_steps} each", "own s", "sum s", "both s",
+            "ns per step and node", "bytes summed", "bytes per s",
+        ]  # fmt: skip
+        print(cli.table(header, rows))
+        print(f"a sum of one number: {1e6 * nothing:.0f} us")
+
+
+def fleet_row(config: Fleet, side: int, rank: distributed.Rank) -> list[str]:
+    """Seconds of an iteration on a rank's own log, of the sum, and of both together."""
+    job = make_job(config.num_steps, (side, side), config.seed + rank.index)
+    own = iterate(job)
+    vector = job.hmm.e_step(job.observations[:10]).to_vector()
+    num_nodes, num_edges = job.hmm.successor.shape
+    num_bytes = distributed.bytes_reduced(num_nodes, num_edges, OBS_DIM)
+
+    def add_up() -> torch.Tensor:
+        return distributed.add_up(vector)
+
+    own_seconds, sum_seconds = best(own), best(add_up, 20)
+    both_seconds = best(lambda: (own(), add_up()))
+    each = 1e9 * own_seconds / (config.num_steps * side**2)
+    cells = [f"{seconds:.3g}" for seconds in (own_seconds, sum_seconds, both_seconds)]
+    return [
+        f"N = {side**2}",
+        *cells,
+        f"{each:.1f}",
+        str(num_bytes),
+        f"{num_bytes / sum_seconds:.2g}",
+    ]
 
 
 def microseconds(seconds: list[float]) -> list[str]:

@@ -113,3 +113,16 @@ def test_without_torchrun_the_job_is_one_process(monkeypatch):
     learning.start(alone, logs, "data", seed=0)
     learning.learn(alone, logs, STAGES[:1])
     assert all(torch.equal(a, b) for a, b in zip(hmm.parameters(), alone.parameters(), strict=True))
+
+
+def test_an_iteration_sums_the_bytes_that_the_formula_says(monkeypatch):
+    """Counted where the ranks' tensors are summed, over every iteration of a job of one."""
+    summed = []
+    monkeypatch.setattr(distributed.dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(distributed.dist, "broadcast", lambda tensor, src: None)
+    monkeypatch.setattr(distributed.dist, "all_reduce", lambda tensor: summed.append(tensor.nbytes))
+    hmm = GridHMM((4, 5), 3)
+    record = distributed.learn(hmm, make_logs(), STAGES[:1])
+    num_nodes, num_edges = hmm.successor.shape
+    assert summed == [distributed.bytes_reduced(num_nodes, num_edges, 3)] * len(record)
+    assert len(record) == 4
