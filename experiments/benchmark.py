@@ -433,17 +433,26 @@ def _time_here(name: str, config: Em) -> float:
 
 def print_scaling(config: Em) -> None:
     """Seconds an iteration by length and by nodes."""
-    rows = []
-    for num_steps in [1_000, 10_000, 100_000] + ([1_000_000] if config.full else []):
-        work = iterate(make_job(num_steps, SHAPE, config.seed))
-        rows.append(growth(num_steps, 400, OBS_DIM, best(work, 9 if num_steps <= 10_000 else 2)))
-    for side in [10, 20, 40] + ([100] if config.full else []):
-        work = iterate(make_job(NUM_STEPS, (side, side), config.seed))
-        rows.append(growth(NUM_STEPS, side**2, OBS_DIM, best(work, 9 if side <= 20 else 2)))
+    jobs = [(num_steps, SHAPE) for num_steps in (1_000, NUM_STEPS, 100_000)]
+    jobs += [(4_000, (side, side)) for side in (10, 20, 40)]
+    if config.full:
+        jobs += [(1_000_000, SHAPE), (4_000, (100, 100))]
+    rows, each = [], []
+    for num_steps, shape in jobs:
+        num_nodes = math.prod(shape)
+        work = iterate(make_job(num_steps, shape, config.seed))
+        seconds = best(work, 9 if num_steps * num_nodes <= 4e6 else 2)
+        rows.append(growth(num_steps, num_nodes, OBS_DIM, seconds))
+        each.append(seconds / (num_steps * num_nodes))
     for obs_dim in (8, 48):
         work = iterate(make_job(NUM_STEPS, SHAPE, config.seed, obs_dim))
         rows.append(growth(NUM_STEPS, 400, obs_dim, best(work)))
     print(cli.table(["growth", "seconds", "ns per step and node"], rows))
+    middle = math.sqrt(min(each) * max(each))
+    off = max(each) / middle - 1
+    print(
+        f"at {OBS_DIM} readings within {100 * off:.0f} % of {1e9 * middle:.1f} ns per step and node"
+    )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"largest memory so far: {peak:.2f} GB\n")
 

@@ -24,7 +24,7 @@ BLOCK = 50_000
 halves all but the last block are run twice, which takes half as long again."""
 
 _CACHE_BLOCK = 512
-"""Steps that pass from one kernel to the next while they are in the cache."""
+"""Steps that are worked on at once where nothing is kept of them."""
 
 _MAX_ENTRIES = 20_000_000
 """Steps times cells that a block holds at most, whatever BLOCK says; an entry takes 16 bytes."""
@@ -215,43 +215,34 @@ class _Message:
         )
         self.normalizer = np.zeros(2)
 
-    def parts(self, block: slice) -> Iterator[tuple[slice, slice]]:
-        """Cut a block to fit the cache, in the message's order: steps, and steps in the block."""
-        for steps in _blocks(block, _CACHE_BLOCK, from_end=not self.is_forward):
-            yield steps, slice(steps.start - block.start, steps.stop - block.start)
-
     def advance(self, block: slice, rows: Rows) -> float:
         """Run the message through one block, from where it stands; returns the log base [nat]."""
-        return sum(self._advance(steps, rows.part(own)) for steps, own in self.parts(block))
-
-    def _advance(self, steps: slice, rows: Rows) -> float:
-        base, log_base = np.empty(len(rows.b)), 0.0
-        observations = self.observations[steps]
-        kernels.emission_rows(observations, *_gaussians(self.chain), rows.b, rows.b_exponent, base)
-        log_base = base.sum()
-        if self.is_forward and steps.start == 0:
-            log_base += self._begin(rows.part(slice(0, 1)))
-            rows = rows.part(slice(1, None))
-        elif not self.is_forward and steps.stop == len(self.observations):
-            log_base += self._begin(rows.part(slice(-1, None)))
-            rows = rows.part(slice(0, -1))
-        done = kernels.message_rows(
-            *self.last, rows.b, rows.b_exponent, *self.edges,
-            rows.mantissa, rows.exponent, rows.base, not self.is_forward,
+        observations, log_base = self.observations[block], 0.0
+        if self.is_forward and block.start == 0:
+            log_base = self._begin(observations[:1], rows.part(slice(0, 1)))
+            observations, rows = observations[1:], rows.part(slice(1, None))
+        elif not self.is_forward and block.stop == len(self.observations):
+            log_base = self._begin(observations[-1:], rows.part(slice(-1, None)))
+            observations, rows = observations[:-1], rows.part(slice(0, -1))
+        log_base += kernels.advance_rows(
+            observations, *_gaussians(self.chain), *self.last, *self.edges, *rows,
+            not self.is_forward,
         )  # fmt: skip
-        if not done:
+        if np.isnan(log_base):
             raise ValueError(_UNREACHABLE)
-        return float(log_base + rows.base.sum() * np.log(2.0))
+        return log_base
 
-    def _begin(self, row: Rows) -> float:
+    def _begin(self, observation: np.ndarray, row: Rows) -> float:
         """Write alpha_1 = pi b_1 (eq. 2), or b_T beta_T with beta_T = 1 (eq. 4); returns a base."""
+        base = np.empty(1)
+        kernels.emission_rows(observation, *_gaussians(self.chain), row.b, row.b_exponent, base)
         start = self.chain.initial_log if self.is_forward else self.chain.log_node
         with np.errstate(divide="ignore"):
             log_row = np.log(row.b, dtype=np.float64) + row.b_exponent * np.log(2.0) + start
-        base = kernels.split_row(log_row, row.mantissa, row.exponent)
+        base += kernels.split_row(log_row, row.mantissa, row.exponent)
         self.last[0][:] = np.tile(row.mantissa[0], 2)
         self.last[1][:] = np.tile(row.exponent[0], 2)
-        return float(base)
+        return float(base[0])
 
     def meet(self, other: Rows) -> float:
         """Begin to cross, at a row (1, G) of the other message; log2 of the two's joint sum."""
@@ -286,7 +277,7 @@ class _Half:
         self.log_base = 0.0
         for block in _blocks(steps, len(rows.b), from_end=not message.is_forward):
             self.starts.append((block, tuple(array.copy() for array in message.last)))
-            self.log_base += message.advance(block, rows)
+            self.log_base += message.advance(block, rows.part(slice(0, block.stop - block.start)))
 
     def from_middle(self) -> Iterator[slice]:
         """Yield the blocks, the one nearest the middle first; earlier ones are run once more."""
@@ -296,7 +287,7 @@ class _Half:
         for block, last in reversed(self.starts):
             for array, start in zip(again.last, last, strict=True):
                 array[:] = start
-            again.advance(block, self.rows)
+            again.advance(block, self.rows.part(slice(0, block.stop - block.start)))
             yield block
 
 
@@ -423,15 +414,14 @@ def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[n
     counts = np.zeros(message.chain.weight_in.shape)
     smoothed, log2_joint = half.rows.mantissa, None
     for block in half.from_middle():
-        for steps, own in message.parts(block):
-            rows = half.rows.part(own)
-            # Both messages take the step over the middle; the forward one counts it.
-            is_counted = message.is_forward or log2_joint is not None
-            if log2_joint is None:
-                nearest = slice(0, 1) if message.is_forward else slice(-1, None)
-                log2_joint = message.meet(rows.part(nearest))
-            smoothed = message.cross(rows, counts, is_counted)
-            visit(int(message.is_forward), steps, smoothed)
+        rows = half.rows.part(slice(0, block.stop - block.start))
+        # Both messages take the step over the middle; the forward one counts it.
+        is_counted = message.is_forward or log2_joint is not None
+        if log2_joint is None:
+            nearest = slice(0, 1) if message.is_forward else slice(-1, None)
+            log2_joint = message.meet(rows.part(nearest))
+        smoothed = message.cross(rows, counts, is_counted)
+        visit(int(message.is_forward), block, smoothed)
     return counts, smoothed[0].astype(np.float64), log2_joint
 
 

@@ -51,6 +51,9 @@ ABSENT = -(1 << 28)
 NEGLIGIBLE = 2.0**-100
 """Posterior below which a cell is left out of a step's sums: they lose at most T times this."""
 
+CACHED_STEPS = 512
+"""Steps whose emissions are evaluated before the message runs over them."""
+
 _FLAGS = {"contract", "nsz", "arcp"}  # never nnan/ninf: infinities and NaN keep their meaning
 
 _LN_2 = math.log(2.0)
@@ -315,6 +318,38 @@ def message_rows(  # type: ignore[no-untyped-def]
             return False
         _rebase(mantissa, exponent, np.int32(base[t]), row, row_exponent, t * num_cells)
     return True
+
+
+@njit(nogil=True, cache=True)
+def advance_rows(  # type: ignore[no-untyped-def]
+    observations, inverse_scale, scaled_mean, log_norm, log_node, power, mantissa, exponent,
+    shift, weight, weight_exponent, row, row_exponent, b, b_exponent, base, backward,
+):  # fmt: skip
+    """Do `emission_rows` and `message_rows` over a block, some steps at a time in the cache.
+
+    One call a block: threads that return to the interpreter in between wait for each other.
+    Returns the log base [nat] of the message; NaN if some step has no mass at all.
+    """
+    num_steps, log_base = len(row), 0.0
+    emission_base = np.empty(CACHED_STEPS)
+    num_parts = -(-num_steps // CACHED_STEPS)
+    for k in range(num_parts):
+        first = (num_parts - 1 - k if backward else k) * CACHED_STEPS
+        last = min(first + CACHED_STEPS, num_steps)
+        emission_rows(
+            observations[first:last], inverse_scale, scaled_mean, log_norm, log_node, power,
+            b[first:last], b_exponent[first:last], emission_base,
+        )  # fmt: skip
+        done = message_rows(
+            mantissa, exponent, b[first:last], b_exponent[first:last],
+            shift, weight, weight_exponent, row[first:last], row_exponent[first:last],
+            base[first:last], backward,
+        )  # fmt: skip
+        if not done:
+            return np.nan
+        for t in range(last - first):
+            log_base += emission_base[t] + base[first + t] * _LN_2
+    return log_base
 
 
 @njit(nogil=True, cache=True)

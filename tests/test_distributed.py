@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import torch
 from rfl_torch import distributed, learning
 from rfl_torch.distributed import Rank
 from rfl_torch.hmm import GridHMM
+
+HERE = Path(__file__).resolve().parent
 
 STAGES = (
     learning.Stage(2, 4, temperature=(0.2, 1.0), pseudo_count=0.1, all_phases=True),
@@ -61,7 +64,7 @@ def torchrun(folder, *arguments):
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     return subprocess.run(
         [*command, script, folder, *arguments],
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": __file__.rpartition("/")[0]},
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{HERE}:{HERE.parent}"},
         capture_output=True,
         text=True,
         timeout=100,
