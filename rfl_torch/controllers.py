@@ -231,7 +231,7 @@ class RBFBank(nn.Module):
     def forward(self, inputs: Tensor, node: Tensor) -> Tensor:
         """Actions (B, A) that the nodes (B,) ask for at rows (o, o') (B, 2 D)."""
         features = self._features(inputs[:, None], self.center[node], self.bandwidth[node])
-        return torch.einsum("bf,bfa->ba", features[:, 0], self.weight[node]) + self.bias[node]
+        return (features @ self.weight[node])[:, 0] + self.bias[node]
 
     @torch.no_grad()
     def fit(self, inputs: Tensor, targets: Tensor, node: Tensor, ridge: float = 0.1) -> float:

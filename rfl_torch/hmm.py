@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import log_softmax
 from torch import Tensor, nn
 
 from rfl_torch import inference
@@ -93,6 +94,19 @@ class Sample(NamedTuple):
 
     nodes: Tensor
     observations: Tensor
+
+
+# Torch wakes its threads for an exp or a log of any size, and they spin in the E-step's way. These,
+# and `log_softmax` in `chain`, stay on the calling thread; they know no gradient.
+
+
+def _exp(x: Tensor) -> Tensor:
+    return torch.from_numpy(np.exp(x.detach().numpy()))
+
+
+def _log(x: Tensor) -> Tensor:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return torch.from_numpy(np.log(x.detach().numpy()))
 
 
 class GridHMM(nn.Module):
@@ -189,12 +203,15 @@ class GridHMM(nn.Module):
     @torch.no_grad()
     def chain(self, temperature: float = 1.0) -> inference.Chain:
         """The parameters laid out for `inference`; emissions raised to `temperature`."""
+        logits = np.where(
+            self.successor_mask.numpy(), self.transition_logits.double().numpy(), -np.inf
+        )
         return inference.build_chain(
             self._diagonals,
-            self.log_transition().double().clamp(min=MIN_LOG_PROB).numpy(),
-            self.initial_logits.double().log_softmax(0).clamp(min=MIN_LOG_PROB).numpy(),
+            np.maximum(log_softmax(logits, 1), MIN_LOG_PROB),
+            np.maximum(log_softmax(self.initial_logits.double().numpy()), MIN_LOG_PROB),
             self.emission_mean.double().numpy(),
-            self.emission_scale.double().numpy(),
+            _exp(self.emission_log_scale).double().numpy(),
             self.cell.numpy(),
             self.num_cells,
             temperature,
@@ -215,7 +232,7 @@ class GridHMM(nn.Module):
     def _expect(self, chain: inference.Chain, sequence: np.ndarray) -> Statistics:
         found = inference.expectations(chain, self._diagonals, sequence)
         edge = torch.zeros(self.successor.shape, dtype=torch.float64)
-        edge[self._diagonals.edge[:, 0], self._diagonals.edge[:, 1]] = torch.from_numpy(found.edge)
+        edge.numpy().ravel()[self._diagonals.slot] = found.edge
         return Statistics(
             torch.from_numpy(found.initial),
             torch.from_numpy(found.node),
@@ -253,11 +270,11 @@ class GridHMM(nn.Module):
             raise ValueError(f"`fixed` names {sorted(unknown)}, which the model does not have.")
         if "initial_logits" not in fixed:
             prob = statistics.initial / statistics.initial.sum()
-            self.initial_logits.copy_(prob.log().clamp(min=MIN_LOG_PROB))
+            self.initial_logits.copy_(_log(prob).clamp(min=MIN_LOG_PROB))
         if "transition_logits" not in fixed:
             counts = (statistics.edge + pseudo_count) * self.successor_mask
             total = counts.sum(1, keepdim=True)
-            log_prob = (counts / total).log().clamp(min=MIN_LOG_PROB)
+            log_prob = _log(counts / total).clamp(min=MIN_LOG_PROB)
             known = (total > MIN_WEIGHT) & self.successor_mask
             self.transition_logits.copy_(torch.where(known, log_prob, self.transition_logits))
         known = statistics.weight > MIN_WEIGHT
@@ -265,12 +282,12 @@ class GridHMM(nn.Module):
         mean = statistics.first / weight
         variance = (statistics.second / weight - mean**2).clamp(min=min_scale**2)
         mean = (1 - trace) * mean + trace * self.emission_mean
-        variance = (1 - trace) * variance + trace * self.emission_scale**2
+        variance = (1 - trace) * variance + trace * _exp(self.emission_log_scale) ** 2
         variance = variance.clamp(min=min_scale**2)
         if "emission_mean" not in fixed:
             self.emission_mean.copy_(torch.where(known, mean, self.emission_mean))
         if "emission_log_scale" not in fixed:
-            log_scale = 0.5 * variance.log()
+            log_scale = 0.5 * _log(variance)
             self.emission_log_scale.copy_(torch.where(known, log_scale, self.emission_log_scale))
 
     def log_likelihood(self, observations: Sequences) -> Tensor:

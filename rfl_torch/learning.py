@@ -219,7 +219,8 @@ def run_stage(
         per_step = statistics.log_likelihood.item() / statistics.num_steps
         if not may_fall:
             watch.refuse_fall(iteration, temperature, per_step)
-        may_fall = bool((hmm.emission_scale < stage.min_scale * (1 - 1e-9)).any())
+        lowest = math.exp(hmm.emission_log_scale.detach().min().item())
+        may_fall = lowest < stage.min_scale * (1 - 1e-9)
         hmm.m_step(
             statistics,
             min_scale=stage.min_scale,
