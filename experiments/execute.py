@@ -2,9 +2,12 @@
 
 python -m experiments.execute --model maze.safetensors --env rfl/RangefinderMaze-v0 --trials 118
 python -m experiments.execute --model maze.safetensors --log log.npz --gif way.gif
+python -m experiments.execute --model acrobot.safetensors --env Acrobot-v1 --hold 4
 
 "believed" counts the tasks that the agent says it has done. "true" needs to know where the goals
-are: a maze's places are known, its nodes only by the training log (--log).
+are: a maze's places are known, its nodes only by the training log (--log). In an environment
+without a ground truth of ours it asks that the last observation is near the goal node's mean, and
+random actions are tried on the same goals: what they reach by chance the agent must exceed.
 """
 
 import contextlib
@@ -18,7 +21,7 @@ from tqdm import tqdm
 
 from experiments import cli, figures, scoring
 from experiments.scoring import MAZE, NodeTable, Task, Trial, World
-from rfl_torch import Agent, Trajectory
+from rfl_torch import Agent
 from rfl_torch.monitor import TensorBoardMonitor
 
 
@@ -29,12 +32,12 @@ class Config:
     model: Path
     """Agent that `experiments.train` wrote."""
     env: str = "rfl/RangefinderMaze-v0"
-    """Environment to act in."""
+    """Environment to act in: an id or module:id."""
     trials: int = 118
     """Tasks of each kind."""
     limit: int | None = None
-    """Control steps of a task; left out, 800, and 1000 for the pendulum."""
-    log: tuple[Path, ...] = ()
+    """Control steps of a task; left out, 800 in the maze, 1000 for the pendulum, 200 elsewhere."""
+    log: tuple[str, ...] = ()
     """The training logs, for where the nodes are: without them no node's goal is checked."""
     goal: int | None = None
     """Go to this node every time, instead of to random ones."""
@@ -46,6 +49,11 @@ class Config:
     """The maze's layout: a built-in name, or the path of a JSON file."""
     env_kwargs: str = "{}"
     """More arguments of the environment, a JSON object such as '{"sensor_noise": 0.02}'."""
+    observation_keys: tuple[str, ...] = ()
+    """Where observations are a dictionary: the keys that the robot senses."""
+    hold: int = 1
+    """Steps that the random walk holds each action for, in environments that are not ours; give
+    the log's."""
     seed: int = 0
     """Seed of the goals, the starts and the executors."""
 
@@ -54,16 +62,26 @@ def main(config: Config) -> None:
     """Run the tasks and print what came of them."""
     _check(config)
     agent = Agent.load(config.model)
-    logs = [Trajectory.load(path) for path in config.log]
+    logs = cli.read_all_logs(config.log, config.observation_keys)
     with contextlib.ExitStack() as stack:
         env, probe = (
-            stack.enter_context(cli.make_env(config.env, config.layout, config.env_kwargs))
+            stack.enter_context(
+                cli.with_action_rows(
+                    cli.make_env(
+                        config.env,
+                        config.layout,
+                        config.env_kwargs,
+                        config.observation_keys,
+                        max_episode_steps=-1,
+                    )
+                )
+            )
             for _ in range(2)
         )
         _check_fit(agent, env)
         world = scoring.world_of(env)
-        truth = scoring.ground_truth(logs) if logs else None
-        if world is None and truth is not None:
+        truth = scoring.ground_truth(logs) if logs and world is not None else None
+        if world is None and logs:
             raise ValueError(
                 f"--log tells where the nodes are, but {config.env!r} has no measure of what is "
                 "near enough; leave it out."
@@ -75,15 +93,30 @@ def main(config: Config) -> None:
             config.logdir.mkdir(parents=True, exist_ok=True)
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
         kinds = _tasks(config, agent, env, probe, table, truth)
-        rows = []
+        rows, note = [], ""
+        limit = config.limit or (FOREIGN_LIMIT if world is None else world.limit)
         for name, tasks in kinds.items():
             start = None if truth is None else truth[-1]
-            trials = run(env, agent, tasks, world, start, config.seed, name, board, config.limit)
+            trials = run(env, agent, tasks, world, start, config.seed, name, board, limit)
             rows.append(row(name, scoring.score(trials, _layout(env))))
             if config.gif is not None and name.startswith("node") and table is not None:
                 animate(config.gif, env, agent, best_trial(trials), table)
-    print(cli.table(HEADER, rows))
+            if world is None:
+                goals = tqdm([trial.goal for trial in trials], desc="random walk", unit="task")
+                walk = scoring.observed_walk_share(
+                    env, agent, goals, limit, config.hold, config.seed
+                )
+                rows.append(["random walk", "-", str(walk), "-", "-", "-"])
+                note = (
+                    f"\ntrue: the last observation is within {scoring.OBSERVED_TOLERANCE:g} of the "
+                    "goal node's mean, rms over the readings, each as a share of its range in the "
+                    f"log; the random walk's: any observation of {limit} steps."
+                )
+    print(cli.table(HEADER, rows) + note)
 
+
+FOREIGN_LIMIT = 200
+"""Steps of a task in an environment that is not ours. Random actions find most goals in time."""
 
 HEADER = ["goals", "believed", "true", "median steps", "median detour", "gave up"]
 

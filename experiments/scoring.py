@@ -7,6 +7,9 @@
     chained       each task starts where the last one ended, the first where the log ended
     independent   each task starts at a random free place of its own
 
+    observed      where the environment tells no ground truth: how near the last observation is to
+                  the goal node's mean, which the agent does not decide by
+
 A task that starts at its goal counts like any other.
 """
 
@@ -31,6 +34,8 @@ Rng = np.random.Generator
 NODE_SPACING = 44.0  # mm; the paper's, sqrt(1000 * 600 / 309)
 WORMHOLE_SPREAD = 60.0  # mm
 PLACE_TOLERANCE = 60.0  # mm
+OBSERVED_TOLERANCE = 0.05
+"""Rms over readings, each as a share of its range in the log: a node's width on a 20 x 20 map."""
 UPRIGHT_TOLERANCE = 0.3  # rad
 UPRIGHT = (math.pi, 0.0)
 
@@ -216,6 +221,8 @@ class Outcome(NamedTuple):
     """The last one."""
     info: dict[str, Any]
     """The last one."""
+    is_over: bool = False
+    """The environment's episode ended with the last observation."""
 
     @property
     def is_believed(self) -> bool:
@@ -258,14 +265,20 @@ def run_task(
         planned = planned or list(executor.path)
         if on_step is not None:
             on_step(executor, info)
-        if executor.status != "running" or len(nodes) > limit or is_over:
+        if executor.status != "running" or len(nodes) > limit:
             break
-        observation, _, terminated, truncated, info = env.step(action)
-        is_over = terminated or truncated
+        if is_over:
+            observation, info = env.reset()
+            is_over = False
+        else:
+            observation, _, terminated, truncated, info = env.step(action)
+            is_over = terminated or truncated
         truths.append(info.get("ground_truth"))
     trace = None if truths[0] is None else np.stack(truths)
     node_array = np.array(nodes, np.int64)
-    return Outcome(executor.status, len(nodes) - 1, trace, node_array, planned, observation, info)
+    return Outcome(
+        executor.status, len(nodes) - 1, trace, node_array, planned, observation, info, is_over
+    )
 
 
 class Trial(NamedTuple):
@@ -363,13 +376,28 @@ def run_tasks(
             observation, info = _reset(env, world, task.start)
         executor = agent.executor(task.goal, seed=seed + index)
         outcome = run_task(env, executor, observation, info, steps)
-        is_true = _is_true(task, outcome, world)
+        if world is None:
+            is_near = observed_distance(agent, outcome.observation, executor.goal)
+            is_true: bool | None = outcome.is_believed and is_near <= OBSERVED_TOLERANCE
+        else:
+            is_true = _is_true(task, outcome, world)
         yield Trial(executor.goal, task.target, outcome, is_true, seed + index)
         observation, info = outcome.observation, outcome.info
+        if outcome.is_over:
+            observation, info = env.reset()
 
 
-def _is_true(task: Task, outcome: Outcome, world: World | None) -> bool | None:
-    if world is None or task.target is None or outcome.trace is None:
+def observed_distance(agent: Agent, observation: NDArray[np.float32], node: int) -> float:
+    """Return the distance of an observation from a node's mean.
+
+    The rms over the readings that there are, each as a share of its range in the log.
+    """
+    mean = agent.hmm.emission_mean[node].detach().numpy()
+    return float(np.sqrt(np.nanmean((agent.normalize(observation) - mean) ** 2)))
+
+
+def _is_true(task: Task, outcome: Outcome, world: World) -> bool | None:
+    if task.target is None or outcome.trace is None:
         return None
     is_near = bool(world.distance(outcome.trace[-1], task.target) <= task.tolerance)
     return outcome.is_believed and is_near
@@ -408,6 +436,41 @@ def random_walk_share(
                 break
             *_, info = env.step(innate.act())
     return found / len(trials)
+
+
+def observed_walk_share(
+    env: gym.Env, agent: Agent, goals: Sequence[int], limit: int, hold: int, seed: int
+) -> "Share":
+    """Return the share of goals that random actions come to, by `observed_distance`, at any time.
+
+    Like the agent's tasks the walk's follow on each other, with as many steps for each.
+
+    Args:
+        env: environment to act in.
+        agent: whose nodes the goals are.
+        goals: one node a task.
+        limit: steps of a task at most.
+        hold: steps that each random action is held for.
+        seed: of the environment and of the actions.
+    """
+    found = 0
+    innate = InnateController(*agent.action_bounds, hold, seed=seed)
+    observation, _ = env.reset(seed=seed)
+    is_over = False
+    for goal in goals:
+        for step in range(limit + 1):
+            if observed_distance(agent, observation, goal) <= OBSERVED_TOLERANCE:
+                found += 1
+                break
+            if step == limit:
+                break
+            if is_over:
+                observation, _ = env.reset()
+                is_over = False
+            else:
+                observation, _, terminated, truncated, _ = env.step(innate.act())
+                is_over = terminated or truncated
+    return wilson(found, len(goals))
 
 
 # -- scores -----------------------------------------------------------------------------------
