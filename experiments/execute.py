@@ -11,9 +11,11 @@ random actions are tried on the same goals: what they reach by chance the agent 
 """
 
 import contextlib
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -42,7 +44,10 @@ class Config:
     goal: int | None = None
     """Go to this node every time, instead of to random ones."""
     gif: Path | None = None
-    """Animation of a task to write; needs --log."""
+    """Animation of a task to write. In our environments it needs --log; elsewhere the environment
+    draws itself."""
+    results: Path | None = None
+    """JSON file to write every number and task to; `experiments.report` reads a results.json."""
     logdir: Path | None = None
     """Folder for TensorBoard's events: `execute/success_rate` after each task."""
     layout: str | None = None
@@ -64,22 +69,16 @@ def main(config: Config) -> None:
     agent = Agent.load(config.model)
     logs = cli.read_all_logs(config.log, config.observation_keys)
     with contextlib.ExitStack() as stack:
-        env, probe = (
-            stack.enter_context(
-                cli.with_action_rows(
-                    cli.make_env(
-                        config.env,
-                        config.layout,
-                        config.env_kwargs,
-                        config.observation_keys,
-                        max_episode_steps=-1,
-                    )
-                )
-            )
-            for _ in range(2)
-        )
+        env, probe = (stack.enter_context(_make_env(config)) for _ in range(2))
         _check_fit(agent, env)
         world = scoring.world_of(env)
+        camera = None
+        if config.gif is not None and world is None:
+            camera = stack.enter_context(_make_env(config, render_mode="rgb_array"))
+            camera.reset()
+            camera.render()  # what it lacks it says now, not after all the tasks
+        elif config.gif is not None and not logs:
+            raise ValueError("--gif draws where the nodes are; give the training log with --log.")
         truth = scoring.ground_truth(logs) if logs and world is not None else None
         if world is None and logs:
             raise ValueError(
@@ -94,24 +93,44 @@ def main(config: Config) -> None:
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
         kinds = _tasks(config, agent, env, probe, table, truth)
         rows, note = [], ""
+        tasks_json: dict[str, Any] = {}
+        trials_json: dict[str, Any] = {}
+        walks_json: dict[str, Any] = {}
         limit = config.limit or (FOREIGN_LIMIT if world is None else world.limit)
         for name, tasks in kinds.items():
             start = None if truth is None else truth[-1]
             trials = run(env, agent, tasks, world, start, config.seed, name, board, limit)
-            rows.append(row(name, scoring.score(trials, _layout(env))))
-            if config.gif is not None and name.startswith("node") and table is not None:
-                animate(config.gif, env, agent, best_trial(trials), table)
+            score = scoring.score(trials, _layout(env))
+            rows.append(row(name, score))
+            tasks_json[name] = score.to_json()
+            trials_json[name] = [trial.to_json() for trial in trials]
+            if config.gif is not None and name.startswith("node"):
+                if camera is not None:
+                    film(config.gif, camera, agent, best_trial(trials), limit)
+                elif table is not None:
+                    animate(config.gif, env, agent, best_trial(trials), table)
             if world is None:
                 goals = tqdm([trial.goal for trial in trials], desc="random walk", unit="task")
                 walk = scoring.observed_walk_share(
                     env, agent, goals, limit, config.hold, config.seed
                 )
+                walks_json[name] = walk._asdict()
                 rows.append(["random walk", "-", str(walk), "-", "-", "-"])
                 note = (
                     f"\ntrue: the last observation is within {scoring.OBSERVED_TOLERANCE:g} of the "
                     "goal node's mean, rms over the readings, each as a share of its range in the "
                     f"log; the random walk's: any observation of {limit} steps."
                 )
+    if config.results is not None:
+        results = {
+            "options": json.loads(json.dumps(asdict(config), default=str)),
+            "limit": limit,
+            "tasks": tasks_json,
+            "random_walk": walks_json,
+            "trials": trials_json,
+        }
+        with cli.replacing(config.results) as new:
+            new.write_text(json.dumps(results, indent=2) + "\n")
     print(cli.table(HEADER, rows) + note)
 
 
@@ -197,6 +216,30 @@ def animate(path: Path, env: gym.Env, agent: Agent, trial: Trial, table: NodeTab
             figures.write_pendulum_gif(new, states, table.mean, planned)
 
 
+def film(path: Path, env: gym.Env, agent: Agent, trial: Trial, limit: int) -> None:
+    """Go to the trial's goal from the environment's own start, and write what `env` renders."""
+    frames: list[Any] = []
+    observation, info = env.reset(seed=trial.seed)
+    executor = agent.executor(trial.goal, seed=trial.seed)
+    scoring.run_task(
+        env, executor, observation, info, limit, lambda *_: frames.append(env.render())
+    )
+    with cli.replacing(path) as new:
+        figures.write_film(new, frames)
+
+
+def _make_env(config: Config, **more: Any) -> gym.Env:
+    env = cli.make_env(
+        config.env,
+        config.layout,
+        config.env_kwargs,
+        config.observation_keys,
+        max_episode_steps=-1,
+        **more,
+    )
+    return cli.with_action_rows(env)
+
+
 def _tasks(
     config: Config,
     agent: Agent,
@@ -227,10 +270,10 @@ def _check(config: Config) -> None:
     cli.check_count("--trials", config.trials)
     if config.limit is not None:
         cli.check_count("--limit", config.limit)
+    if config.results is not None:
+        cli.check_writable(config.results)
     if config.gif is not None:
         cli.check_writable(config.gif)
-        if not config.log:
-            raise ValueError("--gif draws where the nodes are; give the training log with --log.")
 
 
 def _check_fit(agent: Agent, env: gym.Env) -> None:

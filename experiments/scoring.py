@@ -223,6 +223,8 @@ class Outcome(NamedTuple):
     """The last one."""
     is_over: bool = False
     """The environment's episode ended with the last observation."""
+    reason: str = ""
+    """Why the executor gave up."""
 
     @property
     def is_believed(self) -> bool:
@@ -277,7 +279,15 @@ def run_task(
     trace = None if truths[0] is None else np.stack(truths)
     node_array = np.array(nodes, np.int64)
     return Outcome(
-        executor.status, len(nodes) - 1, trace, node_array, planned, observation, info, is_over
+        executor.status,
+        len(nodes) - 1,
+        trace,
+        node_array,
+        planned,
+        observation,
+        info,
+        is_over,
+        executor.reason,
     )
 
 
@@ -293,6 +303,21 @@ class Trial(NamedTuple):
     """Reached in truth; None if the ground truth is unknown."""
     seed: int = 0
     """Seed of the executor."""
+    start_known: bool = True
+    """Whether the first observation looked like a place of the log."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "goal": int(self.goal),
+            "status": self.outcome.status,
+            "reason": self.outcome.reason,
+            "true": self.is_true,
+            "num_steps": self.outcome.num_steps,
+            "start_node": int(self.outcome.nodes[0]),
+            "end_node": int(self.outcome.nodes[-1]),
+            "start_known": self.start_known,
+        }
 
 
 class Task(NamedTuple):
@@ -374,6 +399,7 @@ def run_tasks(
     for index, task in enumerate(tasks):
         if task.start is not None:
             observation, info = _reset(env, world, task.start)
+        start_density = agent.log_emission(agent.normalize(observation)).max()
         executor = agent.executor(task.goal, seed=seed + index)
         outcome = run_task(env, executor, observation, info, steps)
         if world is None:
@@ -381,7 +407,8 @@ def run_tasks(
             is_true: bool | None = outcome.is_believed and is_near <= OBSERVED_TOLERANCE
         else:
             is_true = _is_true(task, outcome, world)
-        yield Trial(executor.goal, task.target, outcome, is_true, seed + index)
+        start_known = bool(start_density >= agent.least_familiar)
+        yield Trial(executor.goal, task.target, outcome, is_true, seed + index, start_known)
         observation, info = outcome.observation, outcome.info
         if outcome.is_over:
             observation, info = env.reset()

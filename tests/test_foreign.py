@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from PIL import Image
 
 from experiments import cli, execute, record, scoring, train
 from rfl_torch import Agent, AgentConfig, Stage, read_logs
@@ -66,10 +67,21 @@ def test_a_point_in_a_maze_is_driven_by_module_and_key(tmp_path, capsys):
         check_spaces(bare)
 
 
+def test_an_environment_films_itself(tmp_path):
+    pytest.importorskip("pygame", reason="no pygame, with which Pendulum-v1 draws itself")
+    _, agent = go(tmp_path, "Pendulum-v1")
+    gif = tmp_path / "way.gif"
+    config = execute.Config(tmp_path / "model.safetensors", "Pendulum-v1", 1, limit=5, gif=gif)
+    execute.main(config)
+    with Image.open(gif) as film:
+        assert film.n_frames > 1
+        assert film.size == (320, 320)
+
+
 class Wandering:
     """An executor that never arrives, and keeps what it sees."""
 
-    status, node, path = "running", 0, ()
+    status, node, path, reason = "running", 0, (), ""
 
     def __init__(self):
         self.seen = []
