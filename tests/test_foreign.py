@@ -1,6 +1,7 @@
 """Environments that were not written here: from their id to goals, by the commands alone."""
 
 import re
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -67,17 +68,6 @@ def test_a_point_in_a_maze_is_driven_by_module_and_key(tmp_path, capsys):
         check_spaces(bare)
 
 
-def test_an_environment_films_itself(tmp_path):
-    pytest.importorskip("pygame", reason="no pygame, with which Pendulum-v1 draws itself")
-    _, agent = go(tmp_path, "Pendulum-v1")
-    gif = tmp_path / "way.gif"
-    config = execute.Config(tmp_path / "model.safetensors", "Pendulum-v1", 1, limit=5, gif=gif)
-    execute.main(config)
-    with Image.open(gif) as film:
-        assert film.n_frames > 1
-        assert film.size == (320, 320)
-
-
 class Wandering:
     """An executor that never arrives, and keeps what it sees."""
 
@@ -89,6 +79,18 @@ class Wandering:
     def act(self, observation):
         self.seen.append(observation)
         return np.array([0.0, 1.0])
+
+
+def test_an_environment_films_itself(tmp_path):
+    pytest.importorskip("pygame", reason="no pygame, with which CartPole-v1 draws itself")
+    agent = SimpleNamespace(executor=lambda goal, seed: Wandering())
+    trial = scoring.Trial(0, None, None, None)
+    with cli.with_action_rows(cli.make_env("CartPole-v1", render_mode="rgb_array")) as env:
+        execute.film(tmp_path / "way.gif", env, agent, trial, limit=5)
+        height, width = env.render().shape[:2]
+    with Image.open(tmp_path / "way.gif") as film:
+        assert film.n_frames == 6
+        assert film.size == (320, round(320 * height / width))
 
 
 def test_a_task_goes_on_when_the_cart_pole_falls():
