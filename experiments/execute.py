@@ -70,7 +70,7 @@ def main(config: Config) -> None:
     logs = cli.read_all_logs(config.log, config.observation_keys)
     with contextlib.ExitStack() as stack:
         env, probe = (stack.enter_context(_make_env(config)) for _ in range(2))
-        _check_fit(agent, env)
+        check_fit(agent, env)
         world = scoring.world_of(env)
         camera = None
         if config.gif is not None and world is None:
@@ -276,7 +276,7 @@ def _check(config: Config) -> None:
         cli.check_writable(config.gif)
 
 
-def _check_fit(agent: Agent, env: gym.Env) -> None:
+def check_fit(agent: Agent, env: gym.Env) -> None:
     """Refuse an environment that the agent has not learned from."""
     shapes = (env.observation_space.shape, env.action_space.shape)
     needed = (agent.observation_low.shape, agent.rest_action.shape)

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from experiments import cli, scoring
 from experiments.figures import BLUE, DPI, GREEN, INK, ORANGE, PALE, RED, WIDTH
 from rfl_torch import Agent, Trajectory, read_logs
-from rfl_torch.monitor import map_layout
 from rfl_torch.planner import largest_component
 
 TEMPLATE = Path(__file__).with_name("report.html")
@@ -99,7 +98,7 @@ def render(config: Config) -> str:
     results = _read_results(config.run)
     walls, world = _surroundings(results)
     nodes = _recognized(agent, logs)
-    place, is_true_place = _places(agent, logs, nodes, world)
+    place, is_true_place = scoring.node_places(agent, logs, world)
     trials = list(_trials(results, model))
     goals = hardest_goals(agent, trials, nodes)
     pictures, left_out = _pictures(config.run)
@@ -181,21 +180,6 @@ def _recognized(agent: Agent, logs: list[Trajectory]) -> NDArray[np.int64]:
     """The node at each step of the logs."""
     paths = [agent.recognize(log.observations) for log in logs]
     return np.concatenate([np.zeros(0, np.int64), *paths])
-
-
-def _places(
-    agent: Agent, logs: list[Trajectory], nodes: NDArray[np.int64], world: scoring.World | None
-) -> tuple[NDArray[np.float64], bool]:
-    """A place (N, 2) for each node, NaN for none, and whether it is the true one."""
-    truths = [log.ground_truth for log in logs if log.ground_truth is not None]
-    if logs and len(truths) == len(logs) and truths[0].shape[1] >= 2:
-        truth = np.concatenate(truths)[:, :2]
-        measure = world or scoring.World("", 0, (1.0, 1.0), 2)
-        return scoring.table_of(nodes, truth, agent.num_nodes, measure).mean, True
-    place = np.full((agent.num_nodes, 2), np.nan)
-    known, plane = map_layout(agent.hmm)
-    place[known] = plane
-    return place, False
 
 
 # -- what it says -----------------------------------------------------------------------------

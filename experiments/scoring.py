@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from rfl_torch import Agent, InnateController, Trajectory
+from rfl_torch.monitor import map_layout
 from rfl_torch.planner import largest_component, threshold_graph
 
 Array = NDArray[np.float64]
@@ -135,6 +136,26 @@ def table_of(nodes: NDArray[np.int64], truth: Array, num_nodes: int, world: Worl
         mean[node] = world.mean(own)
         deviation[node] = np.sqrt((world.offset(own, mean[node]) ** 2).mean(0))
     return NodeTable(mean, deviation, np.bincount(nodes, minlength=num_nodes))
+
+
+def node_places(
+    agent: Agent, logs: Sequence[Trajectory], world: World | None
+) -> tuple[Array, bool]:
+    """Return a place (N, 2) for each node, NaN for none, and whether it is the true one.
+
+    It is where all logs have a ground truth of two dimensions or more; else nodes are laid out
+    from their graph.
+    """
+    truths = [log.ground_truth for log in logs if log.ground_truth is not None]
+    if logs and len(truths) == len(logs) and truths[0].shape[1] >= 2:
+        nodes = np.concatenate([agent.recognize(log.observations) for log in logs])
+        measure = world or World("", 0, (1.0, 1.0), 2)
+        truth = np.concatenate(truths)[:, :2]
+        return table_of(nodes, truth, agent.num_nodes, measure).mean, True
+    place = np.full((agent.num_nodes, 2), np.nan)
+    known, plane = map_layout(agent.hmm)
+    place[known] = plane
+    return place, False
 
 
 # -- the map ----------------------------------------------------------------------------------
