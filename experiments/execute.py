@@ -49,7 +49,8 @@ class Config:
     results: Path | None = None
     """JSON file to write every number and task to; `experiments.report` reads a results.json."""
     logdir: Path | None = None
-    """Folder for TensorBoard's events: `execute/success_rate` after each task."""
+    """Folder for TensorBoard's events: the success rate after each task. A training's own folder
+    is better left alone: give one beside it."""
     layout: str | None = None
     """The maze's layout: a built-in name, or the path of a JSON file."""
     env_kwargs: str = "{}"
@@ -91,6 +92,7 @@ def main(config: Config) -> None:
         if config.logdir is not None:
             config.logdir.mkdir(parents=True, exist_ok=True)
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
+            board.config(asdict(config))
         kinds = _tasks(config, agent, env, probe, table, truth)
         rows, note = [], ""
         tasks_json: dict[str, Any] = {}
@@ -172,7 +174,8 @@ def run(
         done += trial.outcome.is_believed if trial.is_true is None else trial.is_true
         bar.set_postfix(success=f"{done / len(trials):.2f}", refresh=False)
         if board is not None:
-            board.scalar("execute/success_rate", done / len(trials), len(trials))
+            kind = description.rpartition(", ")[2].replace(" ", "_")
+            board.scalar(f"execute/success_rate/{kind}", done / len(trials), len(trials))
     return trials
 
 

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from tqdm import tqdm
 
 from experiments import cli
@@ -94,6 +95,9 @@ def fit(
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             agent = Agent(config, seed).fit(logs, monitor=monitor)
+    if board is not None:
+        path = np.concatenate([agent.recognize(log.observations) for log in logs])
+        board.nodes(agent.hmm, np.bincount(path, minlength=agent.num_nodes))
     for warning in caught:
         print(f"note: {warning.message}", file=sys.stderr)
     return agent

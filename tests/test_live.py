@@ -219,10 +219,10 @@ def server(trained):
     """The command as a user starts it, at a rate that does not bore a test; yields its address."""
     pytest.importorskip("nicegui", reason="the extra `live` is not installed")
     port = free_port()
-    arguments = ["--model", trained / "maze.safetensors", "--log", trained / "log.npz"]
+    files = ["--model", trained / "maze.safetensors", "--log", trained / "log.npz"]
+    arguments = [str(value) for value in [*files, "--port", port, "--rate", 100]]
     process = subprocess.Popen(
-        [sys.executable, "-m", "experiments.live", *map(str, arguments)]
-        + ["--port", str(port), "--rate", "100"],
+        [sys.executable, "-m", "experiments.live", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
