@@ -20,7 +20,8 @@ class InnateController:
     """Draws an action and holds it for `hold` steps.
 
     Args:
-        low, high: bounds of the action space, (A,).
+        low: least action, (A,).
+        high: largest action, (A,).
         hold: steps that each action is held.
         levels: None draws uniformly; 3 draws each dimension from {low, middle, high}, and so on.
         seed: of the draws.
