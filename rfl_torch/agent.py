@@ -392,7 +392,7 @@ class Agent:
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         config = self.config
-        obs_dim = int((state["observation_scale"] > 0).sum())
+        obs_dim = state["hmm.emission_mean"].shape[1]
         self.hmm = GridHMM(config.shape, obs_dim, config.radius, config.metric, config.boundary)
         self.hmm.restore(_with_prefix(state, "hmm."))
         self.observation_low = state["observation_low"].numpy()
