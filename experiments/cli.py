@@ -1,16 +1,20 @@
 """How every command starts, makes its environment, writes its files and fails."""
 
 import contextlib
+import functools
 import io
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import gymnasium as gym
 import tyro
+
+from rfl_torch import Trajectory, read_logs
+from rfl_torch.innate import action_bounds, env_action
 
 Config = TypeVar("Config")
 
@@ -32,13 +36,20 @@ def run(main: Callable[[Config], None], config: type[Config], description: str |
     sys.exit(0)
 
 
-def make_env(env_id: str, layout: str | None = None, kwargs: str = "{}", **more: Any) -> gym.Env:
+def make_env(
+    env_id: str,
+    layout: str | None = None,
+    kwargs: str = "{}",
+    observation_keys: Sequence[str] = (),
+    **more: Any,
+) -> gym.Env:
     """Make the environment `env_id`.
 
     Args:
-        env_id: a registered id.
+        env_id: a registered id; `module:id` imports the module that registers it.
         layout: passed on as `layout=` if not None.
         kwargs: more arguments of the environment, a JSON object.
+        observation_keys: of dictionary observations, those to join into one vector.
         more: arguments of `gym.make`.
 
     Raises:
@@ -56,9 +67,41 @@ def make_env(env_id: str, layout: str | None = None, kwargs: str = "{}", **more:
         arguments["layout"] = layout
     _import_sims()
     try:
-        return gym.make(env_id, disable_env_checker=True, **more, **arguments)
+        env = gym.make(env_id, disable_env_checker=True, **more, **arguments)
     except (TypeError, ModuleNotFoundError, gym.error.Error) as error:
         raise ValueError(f"environment {env_id!r} can't be made: {error}") from None
+    return _joined(env, observation_keys) if observation_keys else env
+
+
+def _joined(env: gym.Env, keys: Sequence[str]) -> gym.Env:
+    """Make dictionary observations one vector of the values of some keys."""
+    space = env.observation_space
+    known = sorted(space) if isinstance(space, gym.spaces.Dict) else []
+    if missing := [key for key in keys if key not in known]:
+        env.close()
+        raise ValueError(
+            f"--observation-keys names {missing}, but the environment's observations have "
+            + (f"the keys {known}." if known else f"no keys: {space}; leave it out.")
+        )
+    return gym.wrappers.FlattenObservation(gym.wrappers.FilterObservation(env, list(keys)))
+
+
+def with_action_rows(env: gym.Env) -> gym.Env:
+    """Let the environment take the action rows of a log: those of a Box are its own."""
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Discrete):
+        return env
+    low, high = action_bounds(space)
+    return gym.wrappers.TransformAction(
+        env, functools.partial(env_action, space), gym.spaces.Box(low, high)
+    )
+
+
+def read_all_logs(
+    sources: Sequence[str | Path], observation_keys: Sequence[str] = ()
+) -> list[Trajectory]:
+    """Read the logs of all files and data sets."""
+    return [log for source in sources for log in read_logs(source, observation_keys)]
 
 
 def check_writable(path: Path) -> None:

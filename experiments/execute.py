@@ -2,15 +2,20 @@
 
 python -m experiments.execute --model maze.safetensors --env rfl/RangefinderMaze-v0 --trials 118
 python -m experiments.execute --model maze.safetensors --log log.npz --gif way.gif
+python -m experiments.execute --model acrobot.safetensors --env Acrobot-v1 --hold 4
 
 "believed" counts the tasks that the agent says it has done. "true" needs to know where the goals
-are: a maze's places are known, its nodes only by the training log (--log).
+are: a maze's places are known, its nodes only by the training log (--log). In an environment
+without a ground truth of ours it asks that the last observation is near the goal node's mean, and
+random actions are tried on the same goals: what they reach by chance the agent must exceed.
 """
 
 import contextlib
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +23,7 @@ from tqdm import tqdm
 
 from experiments import cli, figures, scoring
 from experiments.scoring import MAZE, NodeTable, Task, Trial, World
-from rfl_torch import Agent, Trajectory
+from rfl_torch import Agent
 from rfl_torch.monitor import TensorBoardMonitor
 
 
@@ -29,23 +34,32 @@ class Config:
     model: Path
     """Agent that `experiments.train` wrote."""
     env: str = "rfl/RangefinderMaze-v0"
-    """Environment to act in."""
+    """Environment to act in: an id or module:id."""
     trials: int = 118
     """Tasks of each kind."""
     limit: int | None = None
-    """Control steps of a task; left out, 800, and 1000 for the pendulum."""
-    log: tuple[Path, ...] = ()
+    """Control steps of a task; left out, 800 in the maze, 1000 for the pendulum, 200 elsewhere."""
+    log: tuple[str, ...] = ()
     """The training logs, for where the nodes are: without them no node's goal is checked."""
     goal: int | None = None
     """Go to this node every time, instead of to random ones."""
     gif: Path | None = None
-    """Animation of a task to write; needs --log."""
+    """Animation of a task to write. In our environments it needs --log; elsewhere the environment
+    draws itself."""
+    results: Path | None = None
+    """JSON file to write every number and task to; `experiments.report` reads a results.json."""
     logdir: Path | None = None
-    """Folder for TensorBoard's events: `execute/success_rate` after each task."""
+    """Folder for TensorBoard's events: the success rate after each task. A training's own folder
+    is better left alone: give one beside it."""
     layout: str | None = None
     """The maze's layout: a built-in name, or the path of a JSON file."""
     env_kwargs: str = "{}"
     """More arguments of the environment, a JSON object such as '{"sensor_noise": 0.02}'."""
+    observation_keys: tuple[str, ...] = ()
+    """Where observations are a dictionary: the keys that the robot senses."""
+    hold: int = 1
+    """Steps that the random walk holds each action for, in environments that are not ours; give
+    the log's."""
     seed: int = 0
     """Seed of the goals, the starts and the executors."""
 
@@ -54,16 +68,20 @@ def main(config: Config) -> None:
     """Run the tasks and print what came of them."""
     _check(config)
     agent = Agent.load(config.model)
-    logs = [Trajectory.load(path) for path in config.log]
+    logs = cli.read_all_logs(config.log, config.observation_keys)
     with contextlib.ExitStack() as stack:
-        env, probe = (
-            stack.enter_context(cli.make_env(config.env, config.layout, config.env_kwargs))
-            for _ in range(2)
-        )
-        _check_fit(agent, env)
+        env, probe = (stack.enter_context(_make_env(config)) for _ in range(2))
+        check_fit(agent, env)
         world = scoring.world_of(env)
-        truth = scoring.ground_truth(logs) if logs else None
-        if world is None and truth is not None:
+        camera = None
+        if config.gif is not None and world is None:
+            camera = stack.enter_context(_make_env(config, render_mode="rgb_array"))
+            camera.reset()
+            camera.render()  # what it lacks it says now, not after all the tasks
+        elif config.gif is not None and not logs:
+            raise ValueError("--gif draws where the nodes are; give the training log with --log.")
+        truth = scoring.ground_truth(logs) if logs and world is not None else None
+        if world is None and logs:
             raise ValueError(
                 f"--log tells where the nodes are, but {config.env!r} has no measure of what is "
                 "near enough; leave it out."
@@ -74,16 +92,52 @@ def main(config: Config) -> None:
         if config.logdir is not None:
             config.logdir.mkdir(parents=True, exist_ok=True)
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
+            board.config(asdict(config))
         kinds = _tasks(config, agent, env, probe, table, truth)
-        rows = []
+        rows, note = [], ""
+        tasks_json: dict[str, Any] = {}
+        trials_json: dict[str, Any] = {}
+        walks_json: dict[str, Any] = {}
+        limit = config.limit or (FOREIGN_LIMIT if world is None else world.limit)
         for name, tasks in kinds.items():
             start = None if truth is None else truth[-1]
-            trials = run(env, agent, tasks, world, start, config.seed, name, board, config.limit)
-            rows.append(row(name, scoring.score(trials, _layout(env))))
-            if config.gif is not None and name.startswith("node") and table is not None:
-                animate(config.gif, env, agent, best_trial(trials), table)
-    print(cli.table(HEADER, rows))
+            trials = run(env, agent, tasks, world, start, config.seed, name, board, limit)
+            score = scoring.score(trials, _layout(env))
+            rows.append(row(name, score))
+            tasks_json[name] = score.to_json()
+            trials_json[name] = [trial.to_json() for trial in trials]
+            if config.gif is not None and name.startswith("node"):
+                if camera is not None:
+                    film(config.gif, camera, agent, best_trial(trials), limit)
+                elif table is not None:
+                    animate(config.gif, env, agent, best_trial(trials), table)
+            if world is None:
+                goals = tqdm([trial.goal for trial in trials], desc="random walk", unit="task")
+                walk = scoring.observed_walk_share(
+                    env, agent, goals, limit, config.hold, config.seed
+                )
+                walks_json[name] = walk._asdict()
+                rows.append(["random walk", "-", str(walk), "-", "-", "-"])
+                note = (
+                    f"\ntrue: the last observation is within {scoring.OBSERVED_TOLERANCE:g} of the "
+                    "goal node's mean, rms over the readings, each as a share of its range in the "
+                    f"log; the random walk's: any observation of {limit} steps."
+                )
+    if config.results is not None:
+        results = {
+            "options": json.loads(json.dumps(asdict(config), default=str)),
+            "limit": limit,
+            "tasks": tasks_json,
+            "random_walk": walks_json,
+            "trials": trials_json,
+        }
+        with cli.replacing(config.results) as new:
+            new.write_text(json.dumps(results, indent=2) + "\n")
+    print(cli.table(HEADER, rows) + note)
 
+
+FOREIGN_LIMIT = 200
+"""Steps of a task in an environment that is not ours. Random actions find most goals in time."""
 
 HEADER = ["goals", "believed", "true", "median steps", "median detour", "gave up"]
 
@@ -120,7 +174,8 @@ def run(
         done += trial.outcome.is_believed if trial.is_true is None else trial.is_true
         bar.set_postfix(success=f"{done / len(trials):.2f}", refresh=False)
         if board is not None:
-            board.scalar("execute/success_rate", done / len(trials), len(trials))
+            kind = description.rpartition(", ")[2].replace(" ", "_")
+            board.scalar(f"execute/success_rate/{kind}", done / len(trials), len(trials))
     return trials
 
 
@@ -164,6 +219,30 @@ def animate(path: Path, env: gym.Env, agent: Agent, trial: Trial, table: NodeTab
             figures.write_pendulum_gif(new, states, table.mean, planned)
 
 
+def film(path: Path, env: gym.Env, agent: Agent, trial: Trial, limit: int) -> None:
+    """Go to the trial's goal from the environment's own start, and write what `env` renders."""
+    frames: list[Any] = []
+    observation, info = env.reset(seed=trial.seed)
+    executor = agent.executor(trial.goal, seed=trial.seed)
+    scoring.run_task(
+        env, executor, observation, info, limit, lambda *_: frames.append(env.render())
+    )
+    with cli.replacing(path) as new:
+        figures.write_film(new, frames)
+
+
+def _make_env(config: Config, **more: Any) -> gym.Env:
+    env = cli.make_env(
+        config.env,
+        config.layout,
+        config.env_kwargs,
+        config.observation_keys,
+        max_episode_steps=-1,
+        **more,
+    )
+    return cli.with_action_rows(env)
+
+
 def _tasks(
     config: Config,
     agent: Agent,
@@ -194,13 +273,13 @@ def _check(config: Config) -> None:
     cli.check_count("--trials", config.trials)
     if config.limit is not None:
         cli.check_count("--limit", config.limit)
+    if config.results is not None:
+        cli.check_writable(config.results)
     if config.gif is not None:
         cli.check_writable(config.gif)
-        if not config.log:
-            raise ValueError("--gif draws where the nodes are; give the training log with --log.")
 
 
-def _check_fit(agent: Agent, env: gym.Env) -> None:
+def check_fit(agent: Agent, env: gym.Env) -> None:
     """Refuse an environment that the agent has not learned from."""
     shapes = (env.observation_space.shape, env.action_space.shape)
     needed = (agent.observation_low.shape, agent.rest_action.shape)

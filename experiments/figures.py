@@ -306,6 +306,22 @@ def write_pendulum_gif(
     _write_gif(path, pictures, frame_ms)
 
 
+def write_film(
+    path: Path, frames: Sequence[NDArray[np.uint8]], *, frame_ms: int = 60, width: int = 320
+) -> None:
+    """Animate pictures (height, width, 3) uint8 that an environment rendered.
+
+    Args:
+        path: file to write.
+        frames: one a control step; of more than GIF_FRAMES every n-th is shown, and the last.
+        frame_ms: how long each picture stands [ms].
+        width: pixels of the animation.
+    """
+    shown = [Image.fromarray(frames[step]) for step in _thinned(len(frames))]
+    size = (width, round(width * shown[0].height / shown[0].width))
+    _write_gif(path, [picture.resize(size) for picture in shown], frame_ms)
+
+
 class _Canvas:
     """A finished drawing to paint on, in the coordinates of one of its axes; sizes in pixels."""
 

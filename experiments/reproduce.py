@@ -248,6 +248,10 @@ def results(config: Config, runs: dict[str, list[Run]]) -> dict[str, Any]:
                     "map": run.map_scores,
                     "tasks": {kind: score.to_json() for kind, score in run.scores.items()},
                     "random_walk": run.random_walk,
+                    "trials": {
+                        kind: [trial.to_json() for trial in trials]
+                        for kind, trials in run.trials.items()
+                    },
                 }
                 for run in own
             ]

@@ -7,6 +7,9 @@
     chained       each task starts where the last one ended, the first where the log ended
     independent   each task starts at a random free place of its own
 
+    observed      where the environment tells no ground truth: how near the last observation is to
+                  the goal node's mean, which the agent does not decide by
+
 A task that starts at its goal counts like any other.
 """
 
@@ -23,6 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from rfl_torch import Agent, InnateController, Trajectory
+from rfl_torch.monitor import map_layout
 from rfl_torch.planner import largest_component, threshold_graph
 
 Array = NDArray[np.float64]
@@ -31,6 +35,8 @@ Rng = np.random.Generator
 NODE_SPACING = 44.0  # mm; the paper's, sqrt(1000 * 600 / 309)
 WORMHOLE_SPREAD = 60.0  # mm
 PLACE_TOLERANCE = 60.0  # mm
+OBSERVED_TOLERANCE = 0.05
+"""Rms over readings, each as a share of its range in the log: a node's width on a 20 x 20 map."""
 UPRIGHT_TOLERANCE = 0.3  # rad
 UPRIGHT = (math.pi, 0.0)
 
@@ -132,6 +138,26 @@ def table_of(nodes: NDArray[np.int64], truth: Array, num_nodes: int, world: Worl
     return NodeTable(mean, deviation, np.bincount(nodes, minlength=num_nodes))
 
 
+def node_places(
+    agent: Agent, logs: Sequence[Trajectory], world: World | None
+) -> tuple[Array, bool]:
+    """Return a place (N, 2) for each node, NaN for none, and whether it is the true one.
+
+    It is where all logs have a ground truth of two dimensions or more; else nodes are laid out
+    from their graph.
+    """
+    truths = [log.ground_truth for log in logs if log.ground_truth is not None]
+    if logs and len(truths) == len(logs) and truths[0].shape[1] >= 2:
+        nodes = np.concatenate([agent.recognize(log.observations) for log in logs])
+        measure = world or World("", 0, (1.0, 1.0), 2)
+        truth = np.concatenate(truths)[:, :2]
+        return table_of(nodes, truth, agent.num_nodes, measure).mean, True
+    place = np.full((agent.num_nodes, 2), np.nan)
+    known, plane = map_layout(agent.hmm)
+    place[known] = plane
+    return place, False
+
+
 # -- the map ----------------------------------------------------------------------------------
 
 
@@ -216,6 +242,10 @@ class Outcome(NamedTuple):
     """The last one."""
     info: dict[str, Any]
     """The last one."""
+    is_over: bool = False
+    """The environment's episode ended with the last observation."""
+    reason: str = ""
+    """Why the executor gave up."""
 
     @property
     def is_believed(self) -> bool:
@@ -258,14 +288,28 @@ def run_task(
         planned = planned or list(executor.path)
         if on_step is not None:
             on_step(executor, info)
-        if executor.status != "running" or len(nodes) > limit or is_over:
+        if executor.status != "running" or len(nodes) > limit:
             break
-        observation, _, terminated, truncated, info = env.step(action)
-        is_over = terminated or truncated
+        if is_over:
+            observation, info = env.reset()
+            is_over = False
+        else:
+            observation, _, terminated, truncated, info = env.step(action)
+            is_over = terminated or truncated
         truths.append(info.get("ground_truth"))
     trace = None if truths[0] is None else np.stack(truths)
     node_array = np.array(nodes, np.int64)
-    return Outcome(executor.status, len(nodes) - 1, trace, node_array, planned, observation, info)
+    return Outcome(
+        executor.status,
+        len(nodes) - 1,
+        trace,
+        node_array,
+        planned,
+        observation,
+        info,
+        is_over,
+        executor.reason,
+    )
 
 
 class Trial(NamedTuple):
@@ -280,6 +324,21 @@ class Trial(NamedTuple):
     """Reached in truth; None if the ground truth is unknown."""
     seed: int = 0
     """Seed of the executor."""
+    start_known: bool = True
+    """Whether the first observation looked like a place of the log."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "goal": int(self.goal),
+            "status": self.outcome.status,
+            "reason": self.outcome.reason,
+            "true": self.is_true,
+            "num_steps": self.outcome.num_steps,
+            "start_node": int(self.outcome.nodes[0]),
+            "end_node": int(self.outcome.nodes[-1]),
+            "start_known": self.start_known,
+        }
 
 
 class Task(NamedTuple):
@@ -361,15 +420,32 @@ def run_tasks(
     for index, task in enumerate(tasks):
         if task.start is not None:
             observation, info = _reset(env, world, task.start)
+        start_density = agent.log_emission(agent.normalize(observation)).max()
         executor = agent.executor(task.goal, seed=seed + index)
         outcome = run_task(env, executor, observation, info, steps)
-        is_true = _is_true(task, outcome, world)
-        yield Trial(executor.goal, task.target, outcome, is_true, seed + index)
+        if world is None:
+            is_near = observed_distance(agent, outcome.observation, executor.goal)
+            is_true: bool | None = outcome.is_believed and is_near <= OBSERVED_TOLERANCE
+        else:
+            is_true = _is_true(task, outcome, world)
+        start_known = bool(start_density >= agent.least_familiar)
+        yield Trial(executor.goal, task.target, outcome, is_true, seed + index, start_known)
         observation, info = outcome.observation, outcome.info
+        if outcome.is_over:
+            observation, info = env.reset()
 
 
-def _is_true(task: Task, outcome: Outcome, world: World | None) -> bool | None:
-    if world is None or task.target is None or outcome.trace is None:
+def observed_distance(agent: Agent, observation: NDArray[np.float32], node: int) -> float:
+    """Return the distance of an observation from a node's mean.
+
+    The rms over the readings that there are, each as a share of its range in the log.
+    """
+    mean = agent.hmm.emission_mean[node].detach().numpy()
+    return float(np.sqrt(np.nanmean((agent.normalize(observation) - mean) ** 2)))
+
+
+def _is_true(task: Task, outcome: Outcome, world: World) -> bool | None:
+    if task.target is None or outcome.trace is None:
         return None
     is_near = bool(world.distance(outcome.trace[-1], task.target) <= task.tolerance)
     return outcome.is_believed and is_near
@@ -408,6 +484,41 @@ def random_walk_share(
                 break
             *_, info = env.step(innate.act())
     return found / len(trials)
+
+
+def observed_walk_share(
+    env: gym.Env, agent: Agent, goals: Sequence[int], limit: int, hold: int, seed: int
+) -> "Share":
+    """Return the share of goals that random actions come to, by `observed_distance`, at any time.
+
+    Like the agent's tasks the walk's follow on each other, with as many steps for each.
+
+    Args:
+        env: environment to act in.
+        agent: whose nodes the goals are.
+        goals: one node a task.
+        limit: steps of a task at most.
+        hold: steps that each random action is held for.
+        seed: of the environment and of the actions.
+    """
+    found = 0
+    innate = InnateController(*agent.action_bounds, hold, seed=seed)
+    observation, _ = env.reset(seed=seed)
+    is_over = False
+    for goal in goals:
+        for step in range(limit + 1):
+            if observed_distance(agent, observation, goal) <= OBSERVED_TOLERANCE:
+                found += 1
+                break
+            if step == limit:
+                break
+            if is_over:
+                observation, _ = env.reset()
+                is_over = False
+            else:
+                observation, _, terminated, truncated, _ = env.step(innate.act())
+                is_over = terminated or truncated
+    return wilson(found, len(goals))
 
 
 # -- scores -----------------------------------------------------------------------------------

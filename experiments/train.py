@@ -5,12 +5,15 @@ tensorboard --logdir runs
 """
 
 import contextlib
+import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from tqdm import tqdm
 
 from experiments import cli
@@ -33,14 +36,20 @@ CONFIGS: dict[str, Callable[[], AgentConfig]] = {
 class Config:
     """Options of a training."""
 
-    log: tuple[Path, ...]
-    """Logs that `experiments.record` wrote, or any npz with `observations` and `actions`."""
+    log: tuple[str, ...]
+    """Logs: npz files of `experiments.record` or with `observations` and `actions`, CSV files, or
+    minari:ID of a local data set."""
     out: Path
     """File to write the agent to."""
     logdir: Path | None = None
     """Folder for TensorBoard's events; left out, none are written."""
     config: Literal["default", "paper", "pendulum", "paper-pendulum"] = "default"
     """Choices of the method: the best that we know or the paper's, for the maze or the pendulum."""
+    side: int | None = None
+    """Nodes along each side of the square grid, as `experiments.describe` suggests; left out, as
+    `--config` has it."""
+    observation_keys: tuple[str, ...] = ()
+    """Where a data set's observations are a dictionary: the keys that the robot senses."""
     seed: int = 0
     """Seed of the start of learning."""
 
@@ -50,14 +59,18 @@ def main(config: Config) -> None:
     cli.check_writable(config.out)
     if not config.log:
         raise ValueError("--log names no file; give one log or several.")
-    logs = [Trajectory.load(path) for path in config.log]
+    logs = cli.read_all_logs(config.log, config.observation_keys)
+    choices = CONFIGS[config.config]()
+    if config.side is not None:
+        cli.check_count("--side", config.side)
+        choices = replace(choices, shape=(config.side, config.side))
     begin = time.perf_counter()
     with contextlib.ExitStack() as stack:
         board = None
         if config.logdir is not None:
             config.logdir.mkdir(parents=True, exist_ok=True)
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
-        agent = fit(CONFIGS[config.config](), logs, config.seed, board)
+        agent = fit(choices, logs, config.seed, board)
     save_agent(agent, config.out)
     print(
         f"{config.out}: {agent.num_nodes} nodes, log-likelihood per step "
@@ -79,7 +92,15 @@ def fit(
     total = sum(stage.iterations for stage in config.stages)
     with tqdm(total=total, desc=description, unit="it") as bar:
         monitor = BarMonitor(bar, [stage.iterations for stage in config.stages], board)
-        return Agent(config, seed).fit(logs, monitor=monitor)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            agent = Agent(config, seed).fit(logs, monitor=monitor)
+    if board is not None:
+        path = np.concatenate([agent.recognize(log.observations) for log in logs])
+        board.nodes(agent.hmm, np.bincount(path, minlength=agent.num_nodes))
+    for warning in caught:
+        print(f"note: {warning.message}", file=sys.stderr)
+    return agent
 
 
 def save_agent(agent: Agent, path: Path) -> None:

@@ -5,6 +5,7 @@ recognise the log (2.3), give its triplets to the nodes' controllers (2.4). Exec
 from a fitted agent and leave it unchanged.
 """
 
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol
@@ -100,9 +101,12 @@ class Agent:
     ) -> "Agent":
         """Learn everything from one log or several of the same robot.
 
+        Readings that never change in any of the logs say nothing and are left out, with a
+        warning; the agent still takes them in every observation.
+
         Raises:
-            ValueError: if the logs are empty, too short, of different widths, or hold a reading
-                that never changes.
+            ValueError: if the logs are empty, too short, of different widths, or no reading
+                changes.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
         self._set_spaces(logs)
@@ -144,9 +148,10 @@ class Agent:
             observations = self.normalize(log.observations)
             actions = self._unit_actions(log.actions)
             path = self._extend_map(observations, actions)
+            known = np.where(np.isnan(observations), self._mean[path], observations)
             samples = (
                 torch.from_numpy(path),
-                torch.from_numpy(observations).float(),
+                torch.from_numpy(known).float(),
                 torch.from_numpy(actions),
                 self.config.horizon,
             )
@@ -260,12 +265,20 @@ class Agent:
                 "e.g. 10000."
             )
         observations = np.concatenate([log.observations for log in logs])
-        low, high = np.nanmin(observations, 0), np.nanmax(observations, 0)
-        if (constant := np.flatnonzero(~(high > low))).size:
-            raise ValueError(
-                f"readings {constant.tolist()} never change in the log; they say nothing. Leave "
-                "them out, or check the sensor."
+        is_missing = np.isnan(observations)
+        low = np.where(is_missing, np.inf, observations).min(0)
+        high = np.where(is_missing, -np.inf, observations).max(0)
+        is_constant = ~(high > low)
+        if is_constant.all():
+            raise ValueError("no reading changes in the log; check the sensors.")
+        if is_constant.any():
+            constant = np.flatnonzero(is_constant).tolist()
+            warnings.warn(
+                f"readings {constant} never change in the log; they say nothing and are left out. "
+                "Check the sensor, if they should.",
+                stacklevel=3,
             )
+            low, high = np.where(is_constant, [[0.0], [0.0]], [low, high])
         self.observation_low, self.observation_scale = _unit_range(low, high)
         bounds = [log.bounds for log in logs]
         self.action_bounds = (
@@ -337,7 +350,9 @@ class Agent:
         for log, sequence, path in zip(logs, observations, paths, strict=True):
             densities.append(self._own_log_density(sequence, path))
             actions = torch.from_numpy(self._unit_actions(log.actions))
-            samples = (path, sequence.float(), actions, self.config.horizon)
+            # A missing reading is taken for the node's own, as `control` does.
+            known = torch.where(sequence.isnan(), self.hmm.emission_mean[path], sequence).detach()
+            samples = (path, known.float(), actions, self.config.horizon)
             forward.append(assign_triplets(*samples))
             backward.append(assign_reversed(*samples))
         triplets = concatenate(forward)
@@ -451,14 +466,19 @@ class Agent:
         return ((low + high) / 2).astype(np.float32)
 
     def normalize(self, observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Bring raw readings (..., D) to the range [0, 1] that the log had."""
+        """Bring raw readings (..., D) to the range [0, 1] that the log had.
+
+        Readings that never changed in the log are left out: the last axis may become shorter.
+        """
         values = np.asarray(observations, np.float64)
         if values.shape[-1:] != self.observation_low.shape:
             raise ValueError(
                 f"observation has shape {values.shape}, needs (..., {len(self.observation_low)}) "
                 "as in the log that the agent learned from."
             )
-        return (values - self.observation_low) / self.observation_scale
+        (used,) = np.nonzero(self.observation_scale > 0)
+        kept = np.take(values, used, axis=-1)
+        return (kept - self.observation_low[used]) / self.observation_scale[used]
 
     def recognize(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,)."""
@@ -592,7 +612,7 @@ class Agent:
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         config = self.config
-        obs_dim = len(state["observation_low"])
+        obs_dim = state["hmm.emission_mean"].shape[1]
         self.hmm = GridHMM(config.shape, obs_dim, config.radius, config.metric, config.boundary)
         self.hmm.restore(_with_prefix(state, "hmm."))
         self.observation_low = state["observation_low"].numpy()

@@ -1,6 +1,14 @@
 """The course of a run, written for TensorBoard; the only importer of its SummaryWriter.
 
 tensorboard --logdir runs
+
+    hmm/, time/     scalars of each EM iteration
+    map/graph       the graph of transitions while it unfolds
+    controllers/    loss of the controllers, once they are learned
+    practice/       coverage, success and surprise of goals chosen by the agent
+    execute/        success of goals given to it, by their kind
+    nodes           mean readings in the projector, with a label each
+    config          options of the run
 """
 
 from collections.abc import Mapping
@@ -23,6 +31,10 @@ MIN_EDGE_PROB = 0.01
 
 MAX_MAP_NODES = 3000
 """The map holds the distances between all pairs of nodes: 72 MB, and seconds of work."""
+
+
+MAP_EVERY = 40
+"""EM iterations from one picture of the map to the next; a stage's end has one, too."""
 
 
 class TensorBoardMonitor:
@@ -65,13 +77,38 @@ class TensorBoardMonitor:
         }
         for tag, value in values.items():
             self.scalar(tag, value, self._iteration)
+        if self._iteration % MAP_EVERY == 0:
+            self._map(hmm)
         self._iteration += 1
 
     def on_stage_end(self, hmm: GridHMM, stage: int) -> None:
         """Write the map as a picture, where `map_picture` has one."""
+        self._map(hmm)
+
+    def _map(self, hmm: GridHMM) -> None:
         picture = map_picture(hmm)
         if picture is not None:
-            self.image("map/stage", picture, stage)
+            self.image("map/graph", picture, self._iteration)
+
+    def nodes(self, hmm: GridHMM, num_steps: NDArray[np.int64]) -> None:
+        """Write the nodes' mean readings for the projector, which shows them in three dimensions.
+
+        Args:
+            hmm: the learned map.
+            num_steps: (N,) steps of the log in each node, a label beside its number and cell.
+        """
+        cell = np.stack(np.unravel_index(hmm.cell.numpy(), hmm.shape), 1)
+        axes = [f"axis {i}" for i in range(cell.shape[1])]
+        labels = [
+            [str(value) for value in (node, *own, steps)]
+            for node, (own, steps) in enumerate(zip(cell.tolist(), num_steps, strict=True))
+        ]
+        self._writer.add_embedding(
+            hmm.emission_mean.detach(),
+            metadata=labels,
+            metadata_header=["node", *axes, "steps of the log"],
+            tag="nodes",
+        )
 
     def scalar(self, tag: str, value: float, step: int) -> None:
         """Write one number."""

@@ -3,13 +3,16 @@
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FILE_FORMAT = "rfl_torch/trajectory/1"
 
-_ARRAYS = ("observations", "actions", "action_low", "action_high", "ground_truth")
+ARRAYS = ("observations", "actions", "action_low", "action_high", "ground_truth")
+EPISODES = "episode_steps"
+"""int (K,), in a file of K logs one after the other: the actions of each."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,9 @@ class Trajectory:
         return len(self.actions)
 
     def save(self, path: str | Path) -> None:
-        """Write the log as a compressed npz file."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
-        with open(path, "wb") as file:
-            np.savez_compressed(file, format=np.array(FILE_FORMAT), **arrays)
+        """Write the log as a compressed npz file; `logs.save_logs` writes several into one."""
+        arrays = {name: getattr(self, name) for name in ARRAYS if getattr(self, name) is not None}
+        write_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
@@ -103,18 +105,13 @@ class Trajectory:
         Raises:
             ValueError: if the file is no such npz; it names the file. Nothing in it can run code.
         """
-        try:
-            # Opened here: numpy leaves a damaged file open.
-            with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in _ARRAYS if name in file}
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
+        arrays = read_arrays(path)
+        if EPISODES in arrays:
             raise ValueError(
-                f"{path} is no npz file of plain number arrays, or a damaged one "
-                f"({type(error).__name__}); write it with Trajectory.save or numpy.savez."
-            ) from None
-        if missing := [name for name in _ARRAYS[:2] if name not in arrays]:
+                f"{path} holds {len(arrays[EPISODES])} episodes, and a Trajectory is one; read it "
+                "with rfl_torch.read_logs."
+            )
+        if missing := [name for name in ARRAYS[:2] if name not in arrays]:
             raise ValueError(
                 f"{path} lacks {' and '.join(missing)}; a log needs observations (T+1, D) and "
                 "actions (T, A)."
@@ -123,6 +120,31 @@ class Trajectory:
             return cls(**arrays)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+
+
+def write_arrays(path: str | Path, arrays: dict[str, Any]) -> None:
+    """Write arrays as a compressed npz file of logs."""
+    with open(path, "wb") as file:
+        np.savez_compressed(file, format=np.array(FILE_FORMAT), **arrays)
+
+
+def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an npz file of logs; others in it are left alone.
+
+    Raises:
+        ValueError: if the file is no npz of plain numbers; it names the file.
+    """
+    try:
+        # Opened here: numpy leaves a damaged file open.
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            return {name: file[name] for name in (*ARRAYS, EPISODES) if name in file}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise ValueError(
+            f"{path} is no npz file of plain number arrays, or a damaged one "
+            f"({type(error).__name__}); write it with Trajectory.save or numpy.savez."
+        ) from None
 
 
 def _matrix(name: str, value: NDArray[np.float32]) -> NDArray[np.float32]:

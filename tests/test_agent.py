@@ -269,9 +269,8 @@ def test_an_observation_of_the_wrong_shape_is_refused(agent):
 
 
 def test_logs_that_cannot_be_learned_from_are_refused(log):
-    constant = log.observations.copy()
-    constant[:, 2] = 0.7
-    with pytest.raises(ValueError, match=r"readings \[2\] never change"):
+    constant = np.full_like(log.observations, 0.7)
+    with pytest.raises(ValueError, match="no reading changes"):
         Agent(dot_config()).fit(Trajectory(constant, log.actions))
     with pytest.raises(ValueError, match="too few"):
         Agent(dot_config()).fit(Trajectory(log.observations[:6], log.actions[:5]))
@@ -279,6 +278,30 @@ def test_logs_that_cannot_be_learned_from_are_refused(log):
         Agent(dot_config()).fit([log, Trajectory(log.observations[:, :3], log.actions)])
     with pytest.raises(ValueError, match="no log"):
         Agent(dot_config()).fit([])
+
+
+def test_readings_that_never_change_are_left_out(agent, log, tmp_path):
+    """The agent is then the one that never had them, but for the width that it takes in."""
+    num = len(log.observations)
+    columns = [np.full(num, 0.7), *log.observations.T, np.full(num, np.nan)]
+    wide = Trajectory(np.stack(columns, 1), log.actions, *log.bounds)
+    with pytest.warns(UserWarning, match=r"readings \[0, 5\] never change"):
+        widened = Agent(dot_config()).fit(wide)
+    torch.testing.assert_close(widened.hmm.emission_mean, agent.hmm.emission_mean, rtol=0, atol=0)
+    widened.save(tmp_path / "wide.safetensors")
+    again = Agent.load(tmp_path / "wide.safetensors")
+    observation = wide.observations[7].copy()
+    observation[[0, 5]] = -3.0  # a broken sensor that wakes up says nothing either
+    action = again.executor(0).act(observation)
+    np.testing.assert_array_equal(action, agent.executor(0).act(log.observations[7]))
+
+
+def test_a_log_with_gaps_gives_controllers_that_answer(log):
+    observations = log.observations.copy()
+    observations[np.random.default_rng(0).random(len(observations)) < 0.1, 1] = np.nan
+    gappy = Agent(dot_config()).fit(Trajectory(observations, log.actions, *log.bounds))
+    assert all(torch.isfinite(value).all() for value in gappy.bank.state_dict().values())
+    assert np.isfinite(gappy.executor(0).act(observations[0])).all()
 
 
 def test_blame_is_bounded_and_success_takes_it_back(agent, log):

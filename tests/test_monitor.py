@@ -49,11 +49,35 @@ def test_learning_is_read_back_from_one_event_file(tmp_path, observations):
     np.testing.assert_allclose([event.value for event in likelihood], expected, rtol=1e-6)
     temperature = [event.value for event in events.Scalars("hmm/temperature")]
     np.testing.assert_allclose(temperature, [p.temperature for p in record], rtol=1e-6)
-    images = events.Images("map/stage")
-    assert [(image.step, image.width, image.height) for image in images] == [
-        (0, 640, 640),
-        (1, 640, 640),
-    ]
+    images = events.Images("map/graph")
+    assert [image.step for image in images] == [0, 3, 5]  # the first, and each stage's end
+    assert {(image.width, image.height) for image in images} == {(640, 640)}
+
+
+def test_the_map_is_drawn_again_and_again(tmp_path, monkeypatch, observations):
+    monkeypatch.setattr(monitor, "MAP_EVERY", 2)
+    with TensorBoardMonitor(tmp_path) as writer:
+        learn(GridHMM((3, 3), 2), [observations], (Stage(1, 5, tolerance=0.0),), writer)
+    assert [image.step for image in read(tmp_path).Images("map/graph")] == [0, 2, 4, 5]
+
+
+@pytest.mark.filterwarnings("ignore:.*NumPy:DeprecationWarning")
+def test_nodes_are_written_for_the_projector_with_labels(tmp_path):
+    hmm = GridHMM((2, 3), 4)
+    hmm.keep_nodes(torch.tensor([True, False, True, True, True, True]))
+    with TensorBoardMonitor(tmp_path) as writer:
+        writer.nodes(hmm, np.arange(5) * 10)
+    (vectors,) = tmp_path.rglob("tensors.tsv")
+    np.testing.assert_allclose(
+        np.loadtxt(vectors, delimiter="\t"), hmm.emission_mean.detach(), rtol=1e-6
+    )
+    (labels,) = tmp_path.rglob("metadata.tsv")
+    rows = [line.split("\t") for line in labels.read_text().splitlines()]
+    assert rows[0] == ["node", "axis 0", "axis 1", "steps of the log"]
+    assert rows[2] == ["1", "0", "2", "10"]  # cell 1 was dropped: node 1 is at row 0, column 2
+    assert len(rows) == 6
+    assert len(list(tmp_path.glob("events*"))) == 1
+    assert "nodes" in (tmp_path / "projector_config.pbtxt").read_text()
 
 
 def test_active_nodes_are_those_expected_at_least_once(tmp_path, observations):

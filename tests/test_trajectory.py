@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import DotWorld
 
-from rfl_torch import InnateController, Trajectory, record
+from rfl_torch import InnateController, Trajectory, env_action, record, record_episodes
 
 
 def arrays(num_steps=5):
@@ -110,14 +110,63 @@ def test_three_levels_are_low_middle_and_high():
     assert counts.min() > 900
 
 
-def test_an_episode_that_ends_is_no_log():
-    class Ending(DotWorld):
-        def step(self, action):
-            observation, reward, _, _, info = super().step(action)
-            return observation, reward, True, False, info
+class Ending(DotWorld):
+    """Ends its episodes after four steps."""
 
-    with pytest.raises(ValueError, match="episode ended at step 1 of 10"):
+    def reset(self, **options):
+        self.steps = 0
+        return super().reset(**options)
+
+    def step(self, action):
+        self.steps += 1
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, self.steps == 4, False, info
+
+
+def test_an_episode_that_ends_is_no_log():
+    with pytest.raises(ValueError, match="episode ended at step 4 of 10"):
         record(Ending(), 10)
+
+
+def test_every_episode_becomes_a_log_that_begins_at_a_reset():
+    logs = record_episodes(Ending(), 10, seed=3)
+    assert [log.num_steps for log in logs] == [4, 4, 2]
+    start = DotWorld().reset()[0]
+    for log in logs:
+        np.testing.assert_array_equal(log.observations[0], start)
+    whole = record(DotWorld(), 10, seed=3)
+    np.testing.assert_array_equal(np.concatenate([log.actions for log in logs]), whole.actions)
+    np.testing.assert_array_equal(logs[0].observations, whole.observations[:5])
+
+
+class Discrete:
+    """The space of Gymnasium, by its name: three actions from -1 on."""
+
+    n, start = 3, -1
+
+
+class Choosing(DotWorld):
+    """Takes -1, 0 or 1 and remembers what it was given."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space, self.given = Discrete(), []
+
+    def step(self, action):
+        self.given.append(action)
+        return super().step(np.full(2, float(action)))
+
+
+def test_discrete_actions_are_logged_as_one_hot_rows_and_drawn_evenly():
+    world = Choosing()
+    log = record(world, 3000, hold=2, seed=0)
+    assert all(type(action) is int for action in world.given)
+    np.testing.assert_array_equal(log.actions.argmax(1) - 1, world.given)
+    np.testing.assert_array_equal(np.sort(log.actions, 1), np.tile([0, 0, 1], (3000, 1)))
+    np.testing.assert_allclose(log.actions.mean(0), 1 / 3, atol=0.04)
+    assert env_action(Discrete(), np.array([0.2, 0.1, 0.7])) == 1
+    with pytest.raises(ValueError, match="levels is 2"):
+        record(Choosing(), 10, levels=2)
 
 
 def test_spaces_that_are_no_vectors_are_refused_with_a_wrapper_to_use():
@@ -126,7 +175,7 @@ def test_spaces_that_are_no_vectors_are_refused_with_a_wrapper_to_use():
             super().__init__()
             self.observation_space.shape = (8, 8, 3)
 
-    with pytest.raises(ValueError, match="FlattenObservation"):
+    with pytest.raises(ValueError, match="GrayscaleObservation"):
         record(Image(), 10)
 
     class Unbounded(DotWorld):
