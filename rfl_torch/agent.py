@@ -309,18 +309,21 @@ class Agent:
         looks = np.split(pooled_looks, np.cumsum([len(part) for part in seen])[:-1])
         nodes = repair.split_by_place(looks, [path.numpy() for path in paths])
         values = [sequence.numpy() for sequence in observations]
-        for is_last in (False, True):
-            nodes, num_nodes = repair.number_anew(nodes)
-            self.counts = repair.Counts.of(nodes, values, num_nodes)
-            self._rebuild()
+        for _ in range(2):
+            self._count(nodes, values)
             nodes = [path.numpy() for path in self._recognize_logs(observations)]
-            if is_last:  # drop what the most likely paths leave out
-                kept = torch.from_numpy(np.isin(np.arange(num_nodes), np.concatenate(nodes)))
-                self.hmm.keep_nodes(kept)
-                self._prepare_recognition()
-                nodes, num_nodes = repair.number_anew(nodes)
-                self.counts = repair.Counts.of(nodes, values, num_nodes)
+        nodes = self._count(nodes, values)  # leaves out what the most likely paths leave out
+        self._prepare_recognition()
         return [torch.from_numpy(path) for path in nodes]
+
+    def _count(
+        self, nodes: list[NDArray[np.int64]], observations: list[NDArray[np.float64]]
+    ) -> list[NDArray[np.int64]]:
+        """Make the map what labelled logs say; returns the labels, numbered without gaps."""
+        nodes, num_nodes = repair.number_anew(nodes)
+        self.counts = repair.Counts.of(nodes, observations, num_nodes)
+        self._rebuild()
+        return nodes
 
     def _rebuild(self) -> None:
         """Make the map what the counts say."""

@@ -133,3 +133,13 @@ def test_a_log_of_another_robot_is_refused(half_agent):
     log = dot_log(50)
     with pytest.raises(ValueError, match=r"\(readings, actions\) \(3, 2\), needs \(4, 2\)"):
         Agent.load(half_agent).partial_fit(Trajectory(log.observations[:, :3], log.actions))
+
+
+def test_every_node_of_a_repaired_map_is_on_its_logs_path_and_outlives_saving(tmp_path):
+    log = dot_log(2500, seed=3)
+    agent = Agent(dot_config(shape=(8, 8))).fit(log)
+    assert (agent.visits[:-1] > 0).sum() >= agent.num_nodes - 2  # the last step leaves none
+    assert agent.counts.num_nodes == agent.num_nodes
+    agent.save(tmp_path / "agent.safetensors")
+    again = Agent.load(tmp_path / "agent.safetensors")
+    assert (again.recognize(log.observations) == agent.recognize(log.observations)).all()
