@@ -21,20 +21,20 @@ def test_recognition_finds_the_best_of_all_paths_with_jumps_and_unknown_steps():
     rng = np.random.default_rng(0)
     jump, leave = growth.LOG_JUMP, growth.LOG_LEAVE
     for _ in range(20):
-        rows = 12 * rng.standard_normal((5, 3))
+        rows, unknown = 12 * rng.standard_normal((5, 3)), 8 * rng.standard_normal(5)
         best, best_path = -np.inf, None
         for path in itertools.product(range(4), repeat=5):
-            total = rows[0, path[0]] if path[0] < 3 else -4.0
+            total = rows[0, path[0]] if path[0] < 3 else unknown[0]
             for t in range(1, 5):
                 i, j = path[t - 1], path[t]
                 if i < 3 and j < 3:
                     total += max(log_a[i, j], jump)
                 elif i != j:
                     total += leave
-                total += rows[t, j] if j < 3 else -4.0
+                total += rows[t, j] if j < 3 else unknown[t]
             if total > best:
                 best, best_path = total, path
-        found = growth.recognize(hmm, rows, -4.0)
+        found = growth.recognize(hmm, rows, unknown)
         assert found.tolist() == [growth.UNKNOWN if node == 3 else node for node in best_path]
 
 
