@@ -49,7 +49,7 @@ UNFAMILIAR_SHARE = 0.001
 STRANGE_GOAL = 4.0
 """Radii of a look beyond which a goal is no place that the agent knows."""
 
-HOP_PROBABILITY = 0.05
+HOP_PROBABILITY = 0.005
 """Chance a step that the belief changes over to a node that looks the same."""
 
 MOST_SAMPLES = 256
