@@ -3,6 +3,7 @@
 python -m experiments.benchmark em             one EM iteration against the other libraries
 python -m experiments.benchmark em --full      up to a million steps, and the paper's schedule
 python -m experiments.benchmark online         one control step, at 400 and at 10,000 nodes
+torchrun --standalone --nproc-per-node 2 -m experiments.benchmark fleet      what ranks cost
 
 Seconds are the process's own on one core, and by the wall on several; the best of some runs. A
 library that is not installed is left out with a note; `pip install rfl-torch[peers]` installs them.
@@ -25,8 +26,9 @@ import torch
 import tyro
 
 from experiments import cli
-from rfl_torch import Agent, AgentConfig, Trajectory, inference, learning
+from rfl_torch import Agent, AgentConfig, Trajectory, distributed, inference, learning
 from rfl_torch.hmm import GridHMM, Statistics
+from rfl_torch.planner import largest_component
 
 NUM_STEPS, SHAPE, OBS_DIM = 10_000, (20, 20), 24
 """The job that the table's ratios stand for: the paper's maze."""
@@ -48,7 +50,7 @@ class Em:
 
 @dataclass(frozen=True)
 class Online:
-    """Acting: one step of the filter, and `Executor.act`."""
+    """Acting on a map that is laid out, not learned: a step of the filter, and `Executor.act`."""
 
     cores: int = 1
     """Processor cores to use."""
@@ -60,8 +62,22 @@ class Online:
     """Seed of the data."""
 
 
+@dataclass(frozen=True)
+class Fleet:
+    """Learning by several ranks under torchrun, a core each: the constants of docs/fleet.md."""
+
+    num_steps: int = 10_000
+    """Steps of each rank's log."""
+    sides: tuple[int, ...] = (20, 40)
+    """Sides of the square grids."""
+    seed: int = 0
+    """Seed of the data."""
+
+
 Config = (
-    Annotated[Em, tyro.conf.subcommand("em")] | Annotated[Online, tyro.conf.subcommand("online")]
+    Annotated[Em, tyro.conf.subcommand("em")]
+    | Annotated[Online, tyro.conf.subcommand("online")]
+    | Annotated[Fleet, tyro.conf.subcommand("fleet")]
 )
 
 
@@ -73,8 +89,11 @@ class Job:
     observations: torch.Tensor
 
 
-def main(config: Em | Online) -> None:
+def main(config: Em | Online | Fleet) -> None:
     """Run one of the benchmarks on so many cores."""
+    if isinstance(config, Fleet):
+        benchmark_fleet(config)
+        return
     cli.check_count("cores", config.cores)
     use_cores(config.cores)
     if isinstance(config, Em):
@@ -98,16 +117,24 @@ def use_cores(count: int) -> None:
 def make_log(num_steps: int, seed: int, obs_dim: int = OBS_DIM) -> torch.Tensor:
     """Rays of a random walk in a room with an inner wall, in [0, 1], noise 0.01; (T, D)."""
     rng = np.random.default_rng(seed)
-    heading = np.cumsum(0.3 * rng.standard_normal(num_steps))
-    step = 0.02 * np.stack([np.cos(heading), np.sin(heading)], 1)
-    place = np.cumsum(step, 0)
-    place = np.abs((place + 0.5) % 2 - 1)  # reflected at the walls of the unit square
-    angle = np.arange(obs_dim) * (2 * np.pi / obs_dim)
-    ray = np.stack([np.cos(angle), np.sin(angle)], 1)
+    place = _walk(num_steps, rng)
     observations = 0.01 * rng.standard_normal((num_steps, obs_dim))
     for start in range(0, num_steps, 10_000):
-        observations[start : start + 10_000] += _distances(place[start : start + 10_000], ray)
+        observations[start : start + 10_000] += _rays(place[start : start + 10_000], obs_dim)
     return torch.from_numpy(observations)
+
+
+def _walk(num_steps: int, rng: np.random.Generator) -> np.ndarray:
+    """Places in the unit square, 0.02 apart, (T, 2)."""
+    heading = np.cumsum(0.3 * rng.standard_normal(num_steps))
+    place = np.cumsum(0.02 * np.stack([np.cos(heading), np.sin(heading)], 1), 0)
+    return np.abs((place + 0.5) % 2 - 1)  # reflected at the walls
+
+
+def _rays(place: np.ndarray, obs_dim: int = OBS_DIM) -> np.ndarray:
+    """What is seen from places (T, 2) without noise, (T, D)."""
+    angle = np.arange(obs_dim) * (2 * np.pi / obs_dim)
+    return _distances(place, np.stack([np.cos(angle), np.sin(angle)], 1))
 
 
 def _distances(place: np.ndarray, ray: np.ndarray) -> np.ndarray:
@@ -121,11 +148,11 @@ def _distances(place: np.ndarray, ray: np.ndarray) -> np.ndarray:
     return np.where(is_hit, np.minimum(distance, to_inner), distance) / 1.5
 
 
-def make_job(num_steps: int, shape: tuple[int, int], seed: int) -> Job:
+def make_job(num_steps: int, shape: tuple[int, int], seed: int, obs_dim: int = OBS_DIM) -> Job:
     """The log and a model whose means are random frames of it, shrunk half-way to 0.5."""
-    observations = make_log(num_steps, seed)
+    observations = make_log(num_steps, seed, obs_dim)
     generator = torch.Generator().manual_seed(seed)
-    hmm = GridHMM(shape, OBS_DIM)
+    hmm = GridHMM(shape, obs_dim)
     frames = torch.randint(num_steps, (hmm.num_nodes,), generator=generator)
     with torch.no_grad():
         hmm.emission_mean.copy_(0.5 * observations[frames] + 0.25)
@@ -406,22 +433,34 @@ def _time_here(name: str, config: Em) -> float:
 
 def print_scaling(config: Em) -> None:
     """Seconds an iteration by length and by nodes."""
-    rows = []
-    for num_steps in [1_000, 10_000, 100_000] + ([1_000_000] if config.full else []):
-        work = iterate(make_job(num_steps, SHAPE, config.seed))
-        rows.append(growth(num_steps, 400, best(work, 9 if num_steps <= 10_000 else 2)))
-    for side in [10, 20, 40] + ([100] if config.full else []):
-        work = iterate(make_job(2_000, (side, side), config.seed))
-        rows.append(growth(2_000, side**2, best(work, 5)))
+    jobs = [(num_steps, SHAPE) for num_steps in (1_000, NUM_STEPS, 100_000)]
+    jobs += [(4_000, (side, side)) for side in (10, 20, 40)]
+    if config.full:
+        jobs += [(1_000_000, SHAPE), (4_000, (100, 100))]
+    rows, each = [], []
+    for num_steps, shape in jobs:
+        num_nodes = math.prod(shape)
+        work = iterate(make_job(num_steps, shape, config.seed))
+        seconds = best(work, 9 if num_steps * num_nodes <= 4e6 else 2)
+        rows.append(growth(num_steps, num_nodes, OBS_DIM, seconds))
+        each.append(seconds / (num_steps * num_nodes))
+    for obs_dim in (8, 48):
+        work = iterate(make_job(NUM_STEPS, SHAPE, config.seed, obs_dim))
+        rows.append(growth(NUM_STEPS, 400, obs_dim, best(work)))
     print(cli.table(["growth", "seconds", "ns per step and node"], rows))
+    middle = math.sqrt(min(each) * max(each))
+    off = max(each) / middle - 1
+    print(
+        f"at {OBS_DIM} readings within {100 * off:.0f} % of {1e9 * middle:.1f} ns per step and node"
+    )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"largest memory so far: {peak:.2f} GB\n")
 
 
-def growth(num_steps: int, num_nodes: int, seconds: float) -> list[str]:
+def growth(num_steps: int, num_nodes: int, obs_dim: int, seconds: float) -> list[str]:
     """A row of the table of growth."""
     each = 1e9 * seconds / (num_steps * num_nodes)
-    return [f"T = {num_steps}, N = {num_nodes}", f"{seconds:.3g}", f"{each:.1f}"]
+    return [f"T = {num_steps}, N = {num_nodes}, D = {obs_dim}", f"{seconds:.3g}", f"{each:.1f}"]
 
 
 def print_schedule(config: Em) -> None:
@@ -440,49 +479,120 @@ def benchmark_online(config: Online) -> None:
     cli.check_count("num-steps", config.num_steps)
     rows = []
     for side in config.sides:
-        agent, log = make_agent(side, config.num_steps, config.seed)
-        observations = torch.from_numpy(agent.normalize(log.observations))
+        begin = time.perf_counter()
+        agent = make_agent(side, max(2_000, 4 * side**2), config.seed)
+        print(f"{agent.num_nodes} nodes: set up in {time.perf_counter() - begin:.1f} s")
         for name, seconds in (
-            ("filter step", filter_times(agent, observations)),
-            ("Executor.act", act_times(agent, log)),
+            ("filter step", filter_times(agent, config.num_steps, config.seed)),
+            ("Executor.act", act_times(agent, config.num_steps, config.seed)),
         ):
             rows.append([f"{name}, N = {side**2}", *microseconds(seconds)])
     print(cli.table(["one control step", "median us", "99 % us"], rows))
 
 
-def make_agent(side: int, num_steps: int, seed: int) -> tuple[Agent, Trajectory]:
-    """An agent whose map has as many nodes as the grid, and a log to drive it with."""
-    observations = make_log(num_steps + 1, seed).float().numpy()
-    actions = np.diff(observations[:, :2], axis=0).astype(np.float32)
+def make_agent(side: int, num_steps: int, seed: int) -> Agent:
+    """An agent whose map is known: a node at every place of a lattice over the room.
+
+    It learns controllers and edges from a walk of `num_steps`, as it would after EM.
+    """
+    rng = np.random.default_rng(seed)
+    place = _walk(num_steps + 1, rng)
+    actions = np.diff(place, axis=0).astype(np.float32)
     bound = np.full(2, np.abs(actions).max(), np.float32)
-    log = Trajectory(observations, actions, action_low=-bound, action_high=bound)
-    stages = (learning.Stage(1, 2, (0.1, 0.1), pseudo_count=1.0, min_scale=0.05),)
-    agent = Agent(replace(AgentConfig(), shape=(side, side), stages=stages), seed=seed)
-    with mock.patch.object(learning, "prune"):  # all nodes are to stay
-        return agent.fit(log), log
+    log = Trajectory(_see(place, rng), actions, action_low=-bound, action_high=bound)
+    agent = Agent(replace(AgentConfig(), shape=(side, side)), seed=seed)
+    nodes = (np.indices((side, side)).reshape(2, -1).T + 0.5) / side
+
+    @torch.no_grad()
+    def lay_out(hmm: GridHMM, *_: object) -> list[learning.Progress]:
+        hmm.emission_mean.copy_(torch.from_numpy(agent.normalize(_rays(nodes))))
+        hmm.emission_log_scale.fill_(math.log(math.hypot(0.01, 0.25 / side)))
+        hmm.transition_logits.zero_()
+        return []
+
+    with mock.patch.object(learning, "learn", lay_out), mock.patch.object(learning, "prune"):
+        return agent.fit(log)
 
 
-def filter_times(agent: Agent, observations: torch.Tensor) -> list[float]:
+def _see(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Noisy observations from places (T, 2), float32 (T, D)."""
+    noise = 0.01 * rng.standard_normal((len(place), OBS_DIM))
+    return (_rays(place) + noise).astype(np.float32)
+
+
+def filter_times(agent: Agent, num_steps: int, seed: int) -> list[float]:
     """Seconds of each step of the filter alone."""
     chain = agent.hmm.chain()
     state, seconds = inference.start_filter(chain), []
-    for observation in observations.double().numpy():
-        begin = time.perf_counter()
+    for observation in agent.normalize(make_log(num_steps, seed).numpy()):
+        begin = clock()
         inference.filter_step(chain, state, observation, 0.01)
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(clock() - begin)
     return seconds
 
 
-def act_times(agent: Agent, log: Trajectory) -> list[float]:
-    """Seconds of each `Executor.act` on the way to a node."""
-    executor, seconds = agent.executor(agent.num_nodes // 2), []
-    for observation in log.observations:
-        begin = time.perf_counter()
-        executor.act(observation)
-        seconds.append(time.perf_counter() - begin)
+def act_times(agent: Agent, num_steps: int, seed: int) -> list[float]:
+    """Seconds of each `Executor.act` of a point robot that drives from one node to the next."""
+    rng = np.random.default_rng(seed)
+    goals = np.flatnonzero(largest_component(agent.graph))
+    place, seconds, reached = np.full((1, 2), 0.5), [], 0
+    executor = agent.executor(int(rng.choice(goals)))
+    for _ in range(num_steps):
+        observation = _see(place, rng)[0]
+        begin = clock()
+        action = executor.act(observation)
+        seconds.append(clock() - begin)
+        place = np.clip(place + action, 0.01, 0.99)
         if executor.status != "running":
-            executor = agent.executor(len(seconds) % agent.num_nodes)
+            reached += executor.status == "reached"
+            executor = agent.executor(int(rng.choice(goals)))
+    print(f"{agent.num_nodes} nodes: the robot reached {reached} goals on the way")
     return seconds
+
+
+def benchmark_fleet(config: Fleet) -> None:
+    """Print what an iteration costs each rank, and what the sum over the ranks adds."""
+    global clock
+    cli.check_count("num-steps", config.num_steps)
+    clock = time.perf_counter  # a rank that waits takes time too
+    torch.set_num_threads(1)
+    with distributed.job() as rank:
+        if hasattr(os, "sched_setaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
+            os.sched_setaffinity(0, {cores[rank.index % len(cores)]})
+        rows = [fleet_row(config, side, rank) for side in config.sides]
+        nothing = best(lambda: distributed.add_up(torch.zeros(1)), 50)
+    if rank.index == 0:
+        header = [
+            f"{rank.count} rank(s), T = {config.num_steps} each", "own s", "sum s", "both s",
+            "ns per step and node", "bytes summed", "bytes per s",
+        ]  # fmt: skip
+        print(cli.table(header, rows))
+        print(f"a sum of one number: {1e6 * nothing:.0f} us")
+
+
+def fleet_row(config: Fleet, side: int, rank: distributed.Rank) -> list[str]:
+    """Seconds of an iteration on a rank's own log, of the sum, and of both together."""
+    job = make_job(config.num_steps, (side, side), config.seed + rank.index)
+    own = iterate(job)
+    vector = job.hmm.e_step(job.observations[:10]).to_vector()
+    num_nodes, num_edges = job.hmm.successor.shape
+    num_bytes = distributed.bytes_reduced(num_nodes, num_edges, OBS_DIM)
+
+    def add_up() -> torch.Tensor:
+        return distributed.add_up(vector)
+
+    own_seconds, sum_seconds = best(own), best(add_up, 20)
+    both_seconds = best(lambda: (own(), add_up()))
+    each = 1e9 * own_seconds / (config.num_steps * side**2)
+    cells = [f"{seconds:.3g}" for seconds in (own_seconds, sum_seconds, both_seconds)]
+    return [
+        f"N = {side**2}",
+        *cells,
+        f"{each:.1f}",
+        str(num_bytes),
+        f"{num_bytes / sum_seconds:.2g}",
+    ]
 
 
 def microseconds(seconds: list[float]) -> list[str]:

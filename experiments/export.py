@@ -106,12 +106,10 @@ def map_graph(agent: Agent, logs: Any = ()) -> nx.DiGraph:
 
 
 def _seen(agent: Agent) -> dict[tuple[int, int], int]:
-    """How often the log took each edge."""
-    source, k = np.nonzero(agent.edge_count.numpy())
-    target = agent.hmm.successor.numpy()[source, k]
-    count = agent.edge_count.numpy()[source, k]
-    pairs = zip(source.tolist(), target.tolist(), strict=True)
-    return dict(zip(pairs, count.tolist(), strict=True))
+    """How often the logs took each edge."""
+    edges = agent.edges.tocoo()
+    pairs = zip(edges.row.tolist(), edges.col.tolist(), strict=True)
+    return dict(zip(pairs, edges.data.astype(int).tolist(), strict=True))
 
 
 class Control(nn.Module):

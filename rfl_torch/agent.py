@@ -6,9 +6,9 @@ from a fitted agent and leave it unchanged.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
-from rfl_torch import inference, learning
+from rfl_torch import growth, inference, learning, repair
 from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
 from rfl_torch.config import AgentConfig
 from rfl_torch.controllers import (
@@ -27,12 +27,14 @@ from rfl_torch.controllers import (
     assign_triplets,
     concatenate,
     explained,
+    latest,
     pool_sparse_nodes,
 )
 from rfl_torch.executor import Executor, make_executor
-from rfl_torch.hmm import GridHMM
+from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.online_svr import SVRBank
 from rfl_torch.planner import look_alikes, seen_edges
+from rfl_torch.practice import Attempt, PracticeMonitor, Strategy, practice
 from rfl_torch.trajectory import Trajectory
 
 Goal = int | NDArray[np.float32] | Callable[[int], bool]
@@ -44,8 +46,14 @@ REVERSIBLE_SHARE = 0.5
 UNFAMILIAR_SHARE = 0.001
 """An observation is unfamiliar if its density is below that of all but this share of the log."""
 
+STRANGE_GOAL = 4.0
+"""Radii of a look beyond which a goal is no place that the agent knows."""
+
 HOP_PROBABILITY = 0.05
 """Chance a step that the belief changes over to a node that looks the same."""
+
+MOST_SAMPLES = 256
+"""Triplets a node that are kept to learn from again when more come."""
 
 MIN_STEPS = 10
 """Shortest log that is accepted: the coarsest stage still needs a few steps."""
@@ -63,8 +71,18 @@ class Agent:
 
     hmm: GridHMM
     bank: Bank
-    edge_count: Tensor
-    """int64 (N, K): how often the recognised log took each edge."""
+    edges: csr_array
+    """(N, N): how often the recognised logs took each edge."""
+    tried: NDArray[np.float64]
+    """(N, K): steps of the logs at each node along each of the `innate.directions`."""
+    counts: repair.Counts | None
+    """What the logs say of each node, if the map was rebuilt by looks and places."""
+    statistics: Statistics | None
+    """What the logs say of each node of a grid, if it was not."""
+    look_radius: float
+    """Mean absolute difference of normalised observations within which places look the same."""
+    samples: Triplets
+    """What the controllers learned from: the latest of each node."""
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
     least_familiar: float
@@ -74,6 +92,7 @@ class Agent:
         self.config = AgentConfig() if config is None else config
         self.seed = seed
         self.record: list[learning.Progress] = []
+        self.counts = self.statistics = None
 
     # -- learning ---------------------------------------------------------------------------
 
@@ -101,8 +120,133 @@ class Agent:
         stages = tuple(stage.tempered(power) for stage in config.stages)
         self.record = learning.learn(self.hmm, observations, stages, monitor)
         learning.prune(self.hmm, observations, power)
-        self._learn_controllers(logs, observations, monitor)
+        paths = self._recognize_logs(observations)
+        self.look_radius = repair.look_radius(
+            self._filled(observations, paths), [self._unit_actions(log.actions) for log in logs]
+        )
+        self._learn_controllers(logs, observations, paths, monitor)
+        if config.repairs and self.is_reversible:
+            paths = self._repair(observations, paths)
+            self._learn_controllers(logs, observations, paths, monitor)
+        else:
+            self.statistics = self.hmm.e_step(observations, power)
         return self
+
+    def partial_fit(self, logs: Trajectory | list[Trajectory]) -> "Agent":
+        """Learn from more data without starting over.
+
+        What the logs show anew becomes new nodes, what they do anew becomes new edges; the nodes
+        that exist keep their numbers. Executors made before go on with the map they know.
+
+        Raises:
+            ValueError: if a log has other readings or actions than those learned from.
+        """
+        logs = [logs] if isinstance(logs, Trajectory) else logs
+        parts = [self.samples]
+        for log in logs:
+            self._check_log(log)
+            observations = self.normalize(log.observations)
+            actions = self._unit_actions(log.actions)
+            path = self._extend_map(observations, actions)
+            known = np.where(np.isnan(observations), self._mean[path], observations)
+            samples = (
+                torch.from_numpy(path),
+                torch.from_numpy(known).float(),
+                torch.from_numpy(actions),
+                self.config.horizon,
+            )
+            parts.append(assign_triplets(*samples))
+            if self.is_reversible:
+                parts.append(assign_reversed(*samples))
+        self.samples = latest(concatenate(parts), MOST_SAMPLES)
+        self._train_bank(self.samples)
+        blamed = self.blamed()
+        self._prepare_planning()
+        self._blame_again(blamed)
+        return self
+
+    def practice(
+        self,
+        env: Any,
+        num_steps: int,
+        seed: int = 0,
+        strategy: Strategy = "frontier",
+        monitor: PracticeMonitor | None = None,
+        progress: Callable[[range], Iterable[int]] = iter,
+    ) -> list[Attempt]:
+        """Choose goals, go there, learn from what happens (step 4 of Fig. 1).
+
+        Args:
+            env: a Gymnasium environment of the robot learned from; it is reset once.
+            num_steps: control steps.
+            seed: of the environment and all choices.
+            strategy: how goals are chosen.
+            monitor: told of coverage, success and surprise after every attempt.
+            progress: wraps the range of steps, as `tqdm.tqdm` does.
+
+        Returns:
+            The attempts, in their order.
+        """
+        return practice(self, env, num_steps, seed, strategy, monitor, progress)
+
+    def _extend_map(
+        self, observations: NDArray[np.float64], actions: NDArray[np.float32]
+    ) -> NDArray[np.int64]:
+        """Take one more log into the map; returns its path."""
+        num_nodes = self.num_nodes
+        if self.counts is not None:
+            rows = inference.log_emission(self.chain, observations)[:, self.chain.cell]
+            path = growth.recognize(self.hmm, rows, self.least_familiar)
+            seen = np.where(np.isnan(observations), self._mean[rows.argmax(1)], observations)
+            path = growth.add_looks(path, seen, self.look_radius, num_nodes)
+            num_nodes = max(num_nodes, int(path.max()) + 1)
+            more = repair.Counts.of([path], [observations], num_nodes)
+            self.counts = self.counts.padded(num_nodes) + more
+            self.edges = self.counts.edges
+            self._rebuild()
+        else:
+            assert self.statistics is not None
+            stage = self.config.stages[-1]
+            self.statistics = learning.partial_fit(
+                self.hmm,
+                observations,
+                self.statistics,
+                temperature=self.config.power(self.hmm.obs_dim),
+                min_scale=stage.min_scale,
+                pseudo_count=stage.pseudo_count,
+            )
+        self._prepare_recognition()
+        if self.counts is None:
+            path = inference.most_likely_path(self._uniform_chain, observations)
+            self.edges = csr_array(self.edges + repair.sum_edges([path], num_nodes))
+        self.tried = np.pad(self.tried, ((0, num_nodes - len(self.tried)), (0, 0)))
+        self.tried += repair.count_directions([path], [actions], num_nodes)
+        return path
+
+    def blamed(self) -> list[tuple[int, int, float]]:
+        """Edges (source, target, factor) that execution found to cost more than the map says."""
+        graph = self.graph.tocoo()
+        factor = graph.data / self.map_cost
+        return [
+            (int(graph.row[k]), int(graph.col[k]), float(factor[k]))
+            for k in np.flatnonzero(factor != 1.0)
+        ]
+
+    def _blame_again(self, blamed: list[tuple[int, int, float]]) -> None:
+        """Raise the costs of edges that are still there."""
+        for source, target, factor in blamed:
+            row = slice(self.graph.indptr[source], self.graph.indptr[source + 1])
+            for edge in row.start + np.flatnonzero(self.graph.indices[row] == target):
+                self.graph.data[edge] = factor * self.map_cost[edge]
+
+    def _check_log(self, log: Trajectory) -> None:
+        widths = (log.observations.shape[1], log.actions.shape[1])
+        needed = (len(self.observation_low), len(self.action_bounds[0]))
+        if widths != needed:
+            raise ValueError(
+                f"the log has (readings, actions) {widths}, needs {needed} as in the log that the "
+                "agent learned from."
+            )
 
     def _set_spaces(self, logs: list[Trajectory]) -> None:
         """Fix the normalisation: readings and actions are brought to [0, 1]."""
@@ -142,22 +286,68 @@ class Agent:
             np.max([high for _, high in bounds], 0),
         )
 
+    def _recognize_logs(self, observations: list[Tensor]) -> list[Tensor]:
+        """Most likely paths under the map as it is now."""
+        self._prepare_recognition()
+        return [
+            torch.from_numpy(inference.most_likely_path(self._uniform_chain, sequence.numpy()))
+            for sequence in observations
+        ]
+
+    def _filled(self, observations: list[Tensor], paths: list[Tensor]) -> list[NDArray[np.float64]]:
+        """The observations, with their nodes' means where a reading is missing."""
+        return [
+            np.where(np.isnan(sequence), self._mean[path], sequence)
+            for sequence, path in zip(map(Tensor.numpy, observations), paths, strict=True)
+        ]
+
+    def _repair(self, observations: list[Tensor], paths: list[Tensor]) -> list[Tensor]:
+        """Rebuild the map by looks and places; returns the logs' paths on the new one."""
+        seen = self._filled(observations, paths)
+        pooled = np.concatenate(seen)
+        pooled_looks, _ = repair.center_looks(pooled, repair.find_looks(pooled, self.look_radius))
+        looks = np.split(pooled_looks, np.cumsum([len(part) for part in seen])[:-1])
+        nodes = repair.split_by_place(looks, [path.numpy() for path in paths])
+        values = [sequence.numpy() for sequence in observations]
+        for is_last in (False, True):
+            nodes, num_nodes = repair.number_anew(nodes)
+            self.counts = repair.Counts.of(nodes, values, num_nodes)
+            self._rebuild()
+            nodes = [path.numpy() for path in self._recognize_logs(observations)]
+            if is_last:  # drop what the most likely paths leave out
+                kept = torch.from_numpy(np.isin(np.arange(num_nodes), np.concatenate(nodes)))
+                self.hmm.keep_nodes(kept)
+                self._prepare_recognition()
+                nodes, num_nodes = repair.number_anew(nodes)
+                self.counts = repair.Counts.of(nodes, values, num_nodes)
+        return [torch.from_numpy(path) for path in nodes]
+
+    def _rebuild(self) -> None:
+        """Make the map what the counts say."""
+        stage = self.config.stages[-1]
+        assert self.counts is not None
+        repair.rebuild(
+            self.hmm, self.counts, self.is_reversible, repair.MIN_SCALE, stage.pseudo_count
+        )
+
     def _learn_controllers(
-        self, logs: list[Trajectory], observations: list[Tensor], monitor: AgentMonitor | None
+        self,
+        logs: list[Trajectory],
+        observations: list[Tensor],
+        paths: list[Tensor],
+        monitor: AgentMonitor | None,
     ) -> None:
-        """Recognise the logs, count the edges they take, train the bank on their triplets.
+        """Count the edges that the logs take, train the bank on their triplets.
 
         Where the controllers so learned predict the log run backwards, the world is reversible:
         they learn from both directions then, and the planner trusts edges taken one way only.
         """
-        self._prepare_recognition()
-        self.edge_count = torch.zeros(self.hmm.successor.shape, dtype=torch.int64)
+        nodes = [path.numpy() for path in paths]
+        self.edges = repair.sum_edges(nodes, self.num_nodes)
+        unit_actions = [self._unit_actions(log.actions) for log in logs]
+        self.tried = repair.count_directions(nodes, unit_actions, self.num_nodes)
         forward, backward, densities = [], [], []
-        for log, sequence in zip(logs, observations, strict=True):
-            path = torch.from_numpy(
-                inference.most_likely_path(self._uniform_chain, sequence.numpy())
-            )
-            self._count_edges(path)
+        for log, sequence, path in zip(logs, observations, paths, strict=True):
             densities.append(self._own_log_density(sequence, path))
             actions = torch.from_numpy(self._unit_actions(log.actions))
             # A missing reading is taken for the node's own, as `control` does.
@@ -173,7 +363,9 @@ class Agent:
             reversed_triplets = concatenate(backward)
             self.is_reversible = explained(self.bank, reversed_triplets) > REVERSIBLE_SHARE
         if self.is_reversible:
-            loss = self._train_bank(concatenate([triplets, reversed_triplets]))
+            triplets = concatenate([triplets, reversed_triplets])
+            loss = self._train_bank(triplets)
+        self.samples = latest(triplets, MOST_SAMPLES)
         if monitor is not None:
             monitor.scalar("controllers/loss", loss, len(self.record))
         self._prepare_planning()
@@ -197,12 +389,6 @@ class Agent:
             log_density = own.log_prob(observations.nan_to_num(0.0))
         return power * log_density.masked_fill(observations.isnan(), 0.0).sum(1)
 
-    def _count_edges(self, path: Tensor) -> None:
-        source, target = path[:-1], path[1:]
-        is_edge = (self.hmm.successor[source] == target[:, None]) & self.hmm.successor_mask[source]
-        edge = is_edge.int().argmax(1)
-        self.edge_count.index_put_((source, edge), torch.ones_like(edge), accumulate=True)
-
     def _prepare_recognition(self) -> None:
         self.chain = self.hmm.chain(self.config.power(self.hmm.obs_dim))
         uniform = np.where(self.chain.is_node, -np.log(self.num_nodes), -np.inf)
@@ -215,8 +401,7 @@ class Agent:
         target = self.hmm.successor.numpy()[rows, columns]
         shape = (self.num_nodes, self.num_nodes)
         prob = self.hmm.log_transition().exp().detach().numpy()[rows, columns]
-        count = csr_array((self.edge_count.numpy()[rows, columns], (rows, target)), shape=shape)
-        seen = seen_edges(count, self.is_reversible)
+        seen = seen_edges(self.edges, self.is_reversible)
         self.alike = self._look_alikes(seen)
         self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)
         self.map_cost = self.graph.data.copy()  # executors raise the graph's where they fail
@@ -270,6 +455,11 @@ class Agent:
         return self.hmm.num_nodes
 
     @property
+    def visits(self) -> NDArray[np.float64]:
+        """Steps of the logs at each node, (N,)."""
+        return np.asarray(self.edges.sum(1)).ravel()
+
+    @property
     def rest_action(self) -> NDArray[np.float32]:
         """The middle of the action space, (A,)."""
         low, high = self.action_bounds
@@ -306,12 +496,14 @@ class Agent:
         Raises:
             ValueError: if the goal is no kept node or no node fulfils it.
         """
-        executor = make_executor(self, self._goal_nodes(goal), seed)
-        if not isinstance(goal, int | np.integer) and not callable(goal):
-            log_density = self.log_emission(self.normalize(goal)).max()
-            if log_density < self.least_familiar:
-                executor.status = "gave_up"
-                executor.reason = "no node looks like the goal: the log has not been there"
+        if isinstance(goal, int | np.integer) or callable(goal):
+            return make_executor(self, self._goal_nodes(goal), seed)
+        nodes = self._goal_nodes(goal)
+        sight = self.normalize(np.asarray(goal))
+        executor = make_executor(self, nodes, seed, sight)
+        if self.strangeness(sight, int(nodes[0])) > STRANGE_GOAL:
+            executor.status = "gave_up"
+            executor.reason = "no node looks like the goal: the log has not been there"
         return executor
 
     def _goal_nodes(self, goal: Goal) -> NDArray[np.int64]:
@@ -330,18 +522,32 @@ class Agent:
                 f"goal has shape {normal.shape}; needs one observation "
                 f"({len(self.observation_low)},) with at least one reading."
             )
-        return np.array([self.log_emission(normal).argmax()])
+        likeliest = int(self.log_emission(normal).argmax())
+        if self.strangeness(normal, likeliest) > 1.0:  # densities of strange sights say little
+            likeliest = int(np.nanmean(np.abs(self._mean - normal), 1).argmin())
+        return np.array([likeliest])
+
+    def strangeness(self, normal: NDArray[np.float64], node: int) -> float:
+        """How far an observation (D,) is from what a node looks like, in radii of a look."""
+        difference = np.abs(normal - self._mean[node])
+        return float(difference[~np.isnan(difference)].mean() / self.look_radius)
 
     def log_emission(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Tempered log-density of one normalised observation (D,) under every node, (N,)."""
         return inference.log_emission(self.chain, normal[None])[0, self.chain.cell]
 
-    def control(self, normal: NDArray[np.float64], node: int) -> NDArray[np.float32]:
-        """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,)."""
+    def control(
+        self, normal: NDArray[np.float64], node: int, target: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float32]:
+        """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,).
+
+        With a `target` (D,), it heads for that observation instead.
+        """
         mean = self._mean[node]
         observation = np.where(np.isnan(normal), mean, normal)
+        target = mean if target is None else np.where(np.isnan(target), mean, target)
         inputs = torch.from_numpy(
-            np.concatenate([observation, mean], dtype=np.float32, casting="same_kind")[None]
+            np.concatenate([observation, target], dtype=np.float32, casting="same_kind")[None]
         )
         with torch.inference_mode():
             unit = self.bank(inputs, torch.tensor([node]))[0].numpy()
@@ -364,8 +570,22 @@ class Agent:
         """Write the agent as one safetensors file."""
         state = {f"hmm.{name}": value for name, value in self.hmm.state_dict().items()}
         state |= {f"bank.{name}": value for name, value in self.bank.state_dict().items()}
+        edges, blamed = self.edges.tocoo(), self.blamed()
+        state |= {f"samples.{name}": value for name, value in self.samples._asdict().items()}
+        if self.counts is not None:
+            state |= {
+                f"counts.{name}": torch.from_numpy(getattr(self.counts, name))
+                for name in ("weight", "first", "second")
+            }
+        if self.statistics is not None:
+            state |= {"statistics": self.statistics.to_vector()}
         state |= {
-            "edge_count": self.edge_count,
+            "edges.pair": torch.from_numpy(np.stack([edges.row, edges.col], 1).astype(np.int64)),
+            "edges.count": torch.from_numpy(edges.data),
+            "blame.pair": torch.tensor([x[:2] for x in blamed], dtype=torch.int64).reshape(-1, 2),
+            "blame.factor": torch.tensor([x[2] for x in blamed], dtype=torch.float64),
+            "tried": torch.from_numpy(self.tried),
+            "look_radius": torch.tensor(self.look_radius, dtype=torch.float64),
             "least_familiar": torch.tensor(self.least_familiar, dtype=torch.float64),
             "is_reversible": torch.tensor(self.is_reversible),
             "observation_low": torch.from_numpy(self.observation_low),
@@ -398,7 +618,17 @@ class Agent:
         self.observation_low = state["observation_low"].numpy()
         self.observation_scale = state["observation_scale"].numpy()
         self.action_bounds = (state["action_low"].numpy(), state["action_high"].numpy())
-        self.edge_count = state["edge_count"]
+        self.look_radius = float(state["look_radius"])
+        self.edges = _sparse(state["edges.pair"], state["edges.count"], self.num_nodes)
+        self.tried = state["tried"].numpy()
+        if "statistics" in state:
+            self.statistics = Statistics.zeros(self.hmm).from_vector(state["statistics"])
+        if "counts.weight" in state:
+            fields = ("weight", "first", "second")
+            self.counts = repair.Counts(
+                self.edges, *(state[f"counts.{name}"].numpy() for name in fields)
+            )
+        self.samples = Triplets(**_with_prefix(state, "samples."))
         self.least_familiar = float(state["least_familiar"])
         self.is_reversible = bool(state["is_reversible"])
         action_dim = len(state["action_low"])
@@ -406,6 +636,14 @@ class Agent:
         self.bank.load_state_dict(_with_prefix(state, "bank."))
         self._prepare_recognition()
         self._prepare_planning()
+        pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()
+        self._blame_again([(i, j, factor) for (i, j), factor in zip(pairs, factors, strict=True)])
+
+
+def _sparse(pair: Tensor, count: Tensor, num_nodes: int) -> csr_array:
+    """Counts of pairs (E, 2) as a matrix (N, N)."""
+    coordinates = (pair[:, 0].numpy(), pair[:, 1].numpy())
+    return csr_array((count.numpy(), coordinates), shape=(num_nodes, num_nodes))
 
 
 def make_bank(kind: str, num_nodes: int, obs_dim: int, action_dim: int) -> Bank:

@@ -58,10 +58,13 @@ class AgentConfig:
     the same few walls are not independent, and counted in full they outvote every transition.
     None counts all, as the paper does."""
     stages: tuple[Stage, ...] = (
-        Stage(2, 200, (0.01, 1.0), pseudo_count=0.01, min_scale=0.02, tolerance=0.0),
-        Stage(1, 40, pseudo_count=0.01, min_scale=0.02),
+        Stage(3, 200, (0.01, 1.0), pseudo_count=0.01, min_scale=0.05, tolerance=0.0),
+        Stage(1, 40, pseudo_count=0.01, min_scale=0.05),
     )
-    """The learning procedure, from coarse time to fine."""
+    """The learning procedure, from coarse time to fine. A high floor of the scales leaves nodes
+    free to tell places apart that look the same, instead of looks that are at one place."""
+    repairs: bool = True
+    """Rebuild the map by looks and places, in a world that the log shows to be reversible."""
     controller: Literal["rbf", "mlp", "svr"] = "rbf"
     """Function estimator of eq. 12; "svr" is the paper's online support vector regression."""
     horizon: int = 1
@@ -79,6 +82,7 @@ class AgentConfig:
             counted_readings=None,
             stages=paper_stages(),
             controller="svr",
+            repairs=False,
             uses_reversal=False,
             executor=ExecutorConfig(recognition="path"),
         )

@@ -91,6 +91,15 @@ def concatenate(parts: list[Triplets]) -> Triplets:
     return Triplets(torch.cat(observation), torch.cat(target), torch.cat(action), torch.cat(node))
 
 
+def latest(triplets: Triplets, most: int) -> Triplets:
+    """The last `most` triplets of each node, in their order."""
+    order = triplets.node.argsort(stable=True)
+    count = torch.bincount(triplets.node)
+    from_end = count.cumsum(0)[triplets.node[order]] - torch.arange(len(order))
+    kept = order[from_end <= most].sort().values
+    return Triplets(*(field[kept] for field in triplets))
+
+
 def pool_sparse_nodes(triplets: Triplets, neighbor: Tensor, neighbor_mask: Tensor) -> Triplets:
     """Lend a node with under LEAST_SAMPLES samples those of its graph neighbours.
 
@@ -222,7 +231,7 @@ class RBFBank(nn.Module):
     def forward(self, inputs: Tensor, node: Tensor) -> Tensor:
         """Actions (B, A) that the nodes (B,) ask for at rows (o, o') (B, 2 D)."""
         features = self._features(inputs[:, None], self.center[node], self.bandwidth[node])
-        return torch.einsum("bf,bfa->ba", features[:, 0], self.weight[node]) + self.bias[node]
+        return (features @ self.weight[node])[:, 0] + self.bias[node]
 
     @torch.no_grad()
     def fit(self, inputs: Tensor, targets: Tensor, node: Tensor, ridge: float = 0.1) -> float:

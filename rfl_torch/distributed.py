@@ -1,7 +1,7 @@
 """EM over the logs of a fleet: one process a share of the logs, one model for all.
 
 The E-step's statistics add, so an iteration is each rank's own E-step, one sum over the ranks of
-8 (2 N + N K + 3 N D + 2) bytes, and the same M-step everywhere. Started by torchrun:
+`bytes_reduced`, and the same M-step everywhere. What it costs: docs/fleet.md. Started by torchrun:
 
     with distributed.job() as rank:
         own = distributed.share(lengths, rank)          # indices of the logs to load
@@ -65,6 +65,11 @@ def share(lengths: Sequence[int], rank: Rank) -> list[int]:
         owner[index] = min(range(rank.count), key=load.__getitem__)
         load[owner[index]] += max(1, lengths[index])
     return [index for index, own in enumerate(owner) if own == rank.index]
+
+
+def bytes_reduced(num_nodes: int, num_edges: int, obs_dim: int) -> int:
+    """Bytes of statistics that an iteration sums over the ranks: N nodes of K edges, D readings."""
+    return 8 * (num_nodes * (2 + num_edges + 3 * obs_dim) + 2)
 
 
 def add_up(tensor: Tensor) -> Tensor:

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from rfl_torch import inference
 from rfl_torch.innate import InnateController
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
+from rfl_torch.repair import LOOK_STEPS
+from rfl_torch.search import Search
 
 if TYPE_CHECKING:
     from rfl_torch.agent import Agent
@@ -26,6 +28,18 @@ Status = Literal["running", "reached", "gave_up"]
 
 BLAME_LIMIT = 100.0
 """An edge costs at most so many times what the map says: costs must still add up in float64."""
+
+STRANGE = 1.0
+"""Radii of a look beyond which an observation is not what its node looks like."""
+
+LOST = 3
+"""Steps in a row that no node explains after which the robot takes itself for lost."""
+
+LONGEST_SEARCH = 2000
+"""Steps in a row without a familiar sight after which a goal is given up."""
+
+APPROACH = 20
+"""Steps from a goal's node to the goal's own sight; then the node is as near as it gets."""
 
 KICK = 20
 """Innate actions after an aborted or a null plan, or the next plan fails where this one did. Three
@@ -50,13 +64,19 @@ class PathExecutor:
         self.node = -1
         self.belief = np.full(agent.num_nodes, 1.0 / agent.num_nodes)
         self.recovering = False
+        self.is_familiar = True
         self.reason = ""
 
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the action of this control step, (A,), inside the action space."""
+    def watch(self, observation: NDArray[np.float32]) -> None:
+        """Follow where the robot is while someone else chooses its actions."""
         normal = self._agent.normalize(observation)
         self._window.append(normal)
         self._recognize()
+        self.is_familiar = self._agent.strangeness(normal, self.node) <= STRANGE
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action of this control step, (A,), inside the action space."""
+        self.watch(observation)
         if self.status == "running" and not self.path and self._babble_left == 0:
             self._plan()
         if self.status != "running":
@@ -65,7 +85,7 @@ class PathExecutor:
             self._babble_left -= 1
             return self._innate.act()
         following = self.path[1] if len(self.path) > 1 else self.goal
-        return self._agent.control(normal, following)
+        return self._agent.control(self._window[-1], following)
 
     def _recognize(self) -> None:
         """Steps 1-3: Viterbi scores over the window, then the best node of the remaining path."""
@@ -111,11 +131,21 @@ class BeliefExecutor:
     is planned anew.
     """
 
-    def __init__(self, agent: "Agent", goals: NDArray[np.int64], seed: int) -> None:
+    def __init__(
+        self,
+        agent: "Agent",
+        goals: NDArray[np.int64],
+        seed: int,
+        sight: NDArray[np.float64] | None = None,
+    ) -> None:
         self._agent, self._config = agent, agent.config.executor
         self._goals = goals
+        self._sight = sight
+        self._approach_left = 0 if sight is None else APPROACH
         self.goal = int(goals[0])
-        self._innate = InnateController(*agent.action_bounds, seed=seed)
+        self._search = Search(*agent.action_bounds, agent.look_radius, seed)
+        self.is_familiar = True
+        self._unfamiliar = 0
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         self._cost_to_go = cost_to_go(self._cost, goals)
         self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
@@ -145,8 +175,21 @@ class BeliefExecutor:
         """Return the action of this control step, (A,), inside the action space."""
         normal = self._agent.normalize(observation)
         self._recognize(normal)
-        if self.status == "running" and self.belief[self._goals].sum() > 0.5:
-            self.status = "reached"
+        is_lost = self._unfamiliar >= LOST
+        is_there = self.belief[self._goals].sum() > 0.5 and self._unfamiliar == 0
+        if self.status == "running" and is_there:
+            if self._approach_left == 0 or self._is_in_sight(normal):
+                self.status = "reached"
+            else:
+                self._approach_left -= 1
+                return self._agent.control(normal, self.node, self._sight)
+        if is_lost and self.status == "running":
+            self.recovering = True
+            self._next = -1
+            if self._unfamiliar <= LONGEST_SEARCH:
+                return self._search.act(normal)
+            self.status = "gave_up"
+            self.reason = f"no node looks like anything seen in the last {LONGEST_SEARCH} steps"
         if self.status == "running":
             self._choose_next()
         if self.status != "running":
@@ -154,18 +197,32 @@ class BeliefExecutor:
         self.recovering = self._babble_left > 0
         if self.recovering:
             self._babble_left -= 1
-            return self._innate.act()
+            return self._search.act(normal)
         return self._agent.control(normal, self._next)
+
+    def _is_in_sight(self, normal: NDArray[np.float64]) -> bool:
+        """Whether the robot sees what it was told to look for, to within a full step."""
+        assert self._sight is not None
+        away = np.nanmean(np.abs(normal - self._sight))
+        return bool(away <= self._agent.look_radius / LOOK_STEPS)
 
     def _recognize(self, normal: NDArray[np.float64]) -> None:
         """Filter: push the belief over the edges, allow a teleport, weigh by the emission."""
         teleport = self._config.teleport
         pushed = self._agent.transition_in @ self.belief
         predicted = (1 - teleport) * pushed + teleport / len(pushed)
-        log_belief = np.log(predicted) + self._agent.log_emission(normal)
+        log_emission = self._agent.log_emission(normal)
+        likeliest = int(log_emission.argmax())
+        self.is_familiar = self._agent.strangeness(normal, likeliest) <= STRANGE
+        self._unfamiliar = 0 if self.is_familiar else self._unfamiliar + 1
+        log_belief = np.log(predicted) + log_emission
         belief = np.exp(log_belief - log_belief.max())
         self.belief = belief / belief.sum()
         self.node = int(self.belief.argmax())
+
+    def watch(self, observation: NDArray[np.float32]) -> None:
+        """Follow where the robot is while someone else chooses its actions."""
+        self._recognize(self._agent.normalize(observation))
 
     def _cheapest_neighbor(self, node: int) -> int:
         """The neighbour over which the goal is cheapest."""
@@ -214,7 +271,7 @@ class BeliefExecutor:
             self._cost_to_go = cost_to_go(self._cost, self._goals)
 
     def _fail(self, reason: str) -> None:
-        """Count a failure; the more in a row, the longer the innate actions take over."""
+        """Count a failure; the more in a row, the longer the search takes over."""
         self._failures += 1
         self._next = -1
         if self._failures > self._config.max_plans:
@@ -227,8 +284,10 @@ class BeliefExecutor:
 Executor = PathExecutor | BeliefExecutor
 
 
-def make_executor(agent: "Agent", goals: NDArray[np.int64], seed: int) -> Executor:
-    """The executor that the agent's configuration asks for."""
+def make_executor(
+    agent: "Agent", goals: NDArray[np.int64], seed: int, sight: NDArray[np.float64] | None = None
+) -> Executor:
+    """The executor that the agent's configuration asks for; `sight` is a goal's observation."""
     if agent.config.executor.recognition == "path":
         return PathExecutor(agent, goals, seed)
-    return BeliefExecutor(agent, goals, seed)
+    return BeliefExecutor(agent, goals, seed, sight)

@@ -82,6 +82,7 @@ def _steps_within(radius: float, metric: Metric, dim: int) -> np.ndarray:
 
 def _seen_before(table: np.ndarray) -> np.ndarray:
     """True where an entry stands further left in its row too."""
-    return np.array(
-        [[value in row[:k].tolist() for k, value in enumerate(row.tolist())] for row in table]
-    )
+    seen = np.zeros(table.shape, bool)
+    for k in range(1, table.shape[1]):
+        seen[:, k] = (table[:, :k] == table[:, k : k + 1]).any(1)
+    return seen

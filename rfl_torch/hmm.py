@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import log_softmax
 from torch import Tensor, nn
 
 from rfl_torch import inference
@@ -54,6 +55,14 @@ class Statistics:
     log_likelihood: Tensor
     num_steps: float
 
+    @classmethod
+    def zeros(cls, hmm: "GridHMM") -> "Statistics":
+        """Nothing seen yet by a model of these shapes."""
+        node, reading = (torch.zeros_like(x) for x in (hmm.initial_logits, hmm.emission_mean))
+        edge = torch.zeros_like(hmm.transition_logits)
+        none = torch.zeros((), dtype=torch.float64)
+        return cls(node, node, edge, reading, reading, reading, none, 0.0)
+
     def __add__(self, other: "Statistics") -> "Statistics":
         """Pool the statistics of two sets of sequences under one model."""
         names = [field.name for field in fields(self)]
@@ -85,6 +94,19 @@ class Sample(NamedTuple):
 
     nodes: Tensor
     observations: Tensor
+
+
+# Torch wakes its threads for an exp or a log of any size, and they spin in the E-step's way. These,
+# and `log_softmax` in `chain`, stay on the calling thread; they know no gradient.
+
+
+def _exp(x: Tensor) -> Tensor:
+    return torch.from_numpy(np.exp(x.detach().numpy()))
+
+
+def _log(x: Tensor) -> Tensor:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return torch.from_numpy(np.log(x.detach().numpy()))
 
 
 class GridHMM(nn.Module):
@@ -181,12 +203,15 @@ class GridHMM(nn.Module):
     @torch.no_grad()
     def chain(self, temperature: float = 1.0) -> inference.Chain:
         """The parameters laid out for `inference`; emissions raised to `temperature`."""
+        logits = np.where(
+            self.successor_mask.numpy(), self.transition_logits.double().numpy(), -np.inf
+        )
         return inference.build_chain(
             self._diagonals,
-            self.log_transition().double().clamp(min=MIN_LOG_PROB).numpy(),
-            self.initial_logits.double().log_softmax(0).clamp(min=MIN_LOG_PROB).numpy(),
+            np.maximum(log_softmax(logits, 1), MIN_LOG_PROB),
+            np.maximum(log_softmax(self.initial_logits.double().numpy()), MIN_LOG_PROB),
             self.emission_mean.double().numpy(),
-            self.emission_scale.double().numpy(),
+            _exp(self.emission_log_scale).double().numpy(),
             self.cell.numpy(),
             self.num_cells,
             temperature,
@@ -207,7 +232,7 @@ class GridHMM(nn.Module):
     def _expect(self, chain: inference.Chain, sequence: np.ndarray) -> Statistics:
         found = inference.expectations(chain, self._diagonals, sequence)
         edge = torch.zeros(self.successor.shape, dtype=torch.float64)
-        edge[self._diagonals.edge[:, 0], self._diagonals.edge[:, 1]] = torch.from_numpy(found.edge)
+        edge.numpy().ravel()[self._diagonals.slot] = found.edge
         return Statistics(
             torch.from_numpy(found.initial),
             torch.from_numpy(found.node),
@@ -245,11 +270,11 @@ class GridHMM(nn.Module):
             raise ValueError(f"`fixed` names {sorted(unknown)}, which the model does not have.")
         if "initial_logits" not in fixed:
             prob = statistics.initial / statistics.initial.sum()
-            self.initial_logits.copy_(prob.log().clamp(min=MIN_LOG_PROB))
+            self.initial_logits.copy_(_log(prob).clamp(min=MIN_LOG_PROB))
         if "transition_logits" not in fixed:
             counts = (statistics.edge + pseudo_count) * self.successor_mask
             total = counts.sum(1, keepdim=True)
-            log_prob = (counts / total).log().clamp(min=MIN_LOG_PROB)
+            log_prob = _log(counts / total).clamp(min=MIN_LOG_PROB)
             known = (total > MIN_WEIGHT) & self.successor_mask
             self.transition_logits.copy_(torch.where(known, log_prob, self.transition_logits))
         known = statistics.weight > MIN_WEIGHT
@@ -257,12 +282,12 @@ class GridHMM(nn.Module):
         mean = statistics.first / weight
         variance = (statistics.second / weight - mean**2).clamp(min=min_scale**2)
         mean = (1 - trace) * mean + trace * self.emission_mean
-        variance = (1 - trace) * variance + trace * self.emission_scale**2
+        variance = (1 - trace) * variance + trace * _exp(self.emission_log_scale) ** 2
         variance = variance.clamp(min=min_scale**2)
         if "emission_mean" not in fixed:
             self.emission_mean.copy_(torch.where(known, mean, self.emission_mean))
         if "emission_log_scale" not in fixed:
-            log_scale = 0.5 * variance.log()
+            log_scale = 0.5 * _log(variance)
             self.emission_log_scale.copy_(torch.where(known, log_scale, self.emission_log_scale))
 
     def log_likelihood(self, observations: Sequences) -> Tensor:
@@ -365,14 +390,37 @@ class GridHMM(nn.Module):
         for name, parameter in list(self.named_parameters()):
             setattr(self, name, nn.Parameter(parameter[kept]))
 
+    def replace_graph(
+        self,
+        successor: Tensor,
+        mask: Tensor,
+        cell: Tensor,
+        transition_logits: Tensor,
+        emission_mean: Tensor,
+        emission_log_scale: Tensor,
+    ) -> None:
+        """Take over other nodes and edges, which need not lie on the lattice.
+
+        Shapes are those of the parameters and buffers. Cells are distinct numbers from 0 to N - 1,
+        near for neighbours: the recursions' cost grows with the number of distinct differences
+        between joined cells.
+        """
+        self.num_cells = len(cell)
+        self._set_graph(successor, mask, cell)
+        self.transition_logits = nn.Parameter(transition_logits)
+        self.initial_logits = nn.Parameter(torch.zeros(len(cell), dtype=torch.float64))
+        self.emission_mean = nn.Parameter(emission_mean)
+        self.emission_log_scale = nn.Parameter(emission_log_scale)
+
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take over the `state_dict` of a model of the same lattice, pruned or not.
+        """Take over the `state_dict` of another model, on its lattice, pruned, or rebuilt.
 
         Raises:
             ValueError: if the tensors don't fit together or contradict the lattice.
         """
         successor, mask, cell = state["successor"], state["successor_mask"], state["cell"]
-        num_nodes, width = len(cell), self.successor.shape[1]
+        num_nodes, width = successor.shape
+        num_cells = max(self.num_cells, num_nodes)
         shapes = {
             "successor": (num_nodes, width),
             "successor_mask": (num_nodes, width),
@@ -384,13 +432,14 @@ class GridHMM(nn.Module):
         for name, shape in shapes.items():
             if tuple(state[name].shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(state[name].shape)}, needs {shape}")
-        in_lattice = (cell >= 0) & (cell < self.num_cells)
-        if not in_lattice.all() or len(cell.unique()) != num_nodes or mask.dtype != torch.bool:
-            raise ValueError(f"cells must be distinct and lie in 0..{self.num_cells - 1}")
+        is_cell = (cell >= 0) & (cell < num_cells)
+        if not is_cell.all() or len(cell.unique()) != num_nodes or mask.dtype != torch.bool:
+            raise ValueError(f"cells must be distinct and lie in 0..{num_cells - 1}")
         if not ((successor >= 0) & (successor < num_nodes)).all() or not mask.any(1).all():
             raise ValueError(f"successors must lie in 0..{num_nodes - 1}, one for each node")
         if not all(state[name].isfinite().all() for name, _ in self.named_parameters()):
             raise ValueError("parameters must be finite")
+        self.num_cells = num_cells
         self._set_graph(successor, mask, cell)
         for name, _ in list(self.named_parameters()):
             setattr(self, name, nn.Parameter(state[name]))

@@ -8,6 +8,7 @@ block when it is crossed, so memory grows with T / BLOCK, not with T.
 Symbols as in `kernels`; equation numbers are the paper's.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -18,17 +19,17 @@ import numpy as np
 from rfl_torch import kernels
 from rfl_torch.simd import LANES, aligned_empty, aligned_full
 
-BLOCK = 32768
+BLOCK = 50_000
 """Steps whose messages are held at once by each of the two threads, 16 bytes a node; of longer
 halves all but the last block are run twice, which takes half as long again."""
 
 _CACHE_BLOCK = 512
-"""Steps that pass from one kernel to the next while they are in the cache."""
+"""Steps that are worked on at once where nothing is kept of them."""
 
-_MAX_ENTRIES = 1 << 24
+_MAX_ENTRIES = 20_000_000
 """Steps times cells that a block holds at most, whatever BLOCK says; an entry takes 16 bytes."""
 
-_MAX_SPARE = 1 << 28
+_MAX_SPARE = 1 << 29
 """Bytes of one working buffer that are kept for the next call: fresh pages cost a tenth of it."""
 
 _UNREACHABLE = (
@@ -71,18 +72,16 @@ class Chain(NamedTuple):
 
 
 class Diagonals(NamedTuple):
-    """Structure of a graph by diagonal, made once: edge (i, k) stands at [diagonal[i, k], cell]."""
+    """Structure of a graph by diagonal, made once: where every edge stands in the tables."""
 
     shift: np.ndarray
     """int64 (O,), the distinct (target cell - source cell) mod G."""
-    edge: np.ndarray
-    """int64 (E, 2), the (node, k) of every edge."""
-    diagonal: np.ndarray
-    """int64 (E,), which shift the edge has."""
-    source: np.ndarray
-    """int64 (E,), its source cell."""
-    target: np.ndarray
-    """int64 (E,), its target cell."""
+    slot: np.ndarray
+    """int64 (E,), node * K + k, in a successor table (N, K) laid out flat."""
+    entering: np.ndarray
+    """int64 (E,), diagonal * G + target cell, in a table (O, G) laid out flat."""
+    leaving: np.ndarray
+    """int64 (E,), diagonal * G + source cell."""
 
 
 def build_diagonals(
@@ -90,11 +89,10 @@ def build_diagonals(
 ) -> Diagonals:
     """Sort the edges of a successor table (N, K) by the shift between their cells."""
     num_cells = _whole_tiles(num_cells)
-    edge = np.argwhere(mask)
-    source = cell[edge[:, 0]]
-    target = cell[successor[edge[:, 0], edge[:, 1]]]
+    slot = np.flatnonzero(mask)
+    source, target = cell[slot // mask.shape[1]], cell[successor.ravel()[slot]]
     shift, diagonal = np.unique((target - source) % num_cells, return_inverse=True)
-    return Diagonals(shift, edge, diagonal, source, target)
+    return Diagonals(shift, slot, diagonal * num_cells + target, diagonal * num_cells + source)
 
 
 def _whole_tiles(num_cells: int) -> int:
@@ -114,18 +112,18 @@ def build_chain(
     """Lay the parameters of N nodes out over the lattice; log_transition (N, K), mean (N, D)."""
     num_cells = _whole_tiles(num_cells)
     shape = (len(diagonals.shift), num_cells)
-    log_weight = log_transition[diagonals.edge[:, 0], diagonals.edge[:, 1]]
+    log_weight = log_transition.ravel()[diagonals.slot]
     log_weight_in = aligned_full(shape, -np.inf, np.float64)
-    log_weight_in[diagonals.diagonal, diagonals.target] = log_weight
-    log2_weight = log_weight / np.log(2.0)
+    log_weight_in.ravel()[diagonals.entering] = log_weight
+    log2_weight = log_weight * (1.0 / np.log(2.0))
     exponent = np.floor(log2_weight)
-    mantissa = np.exp2(log2_weight - exponent).astype(np.float32)
+    mantissa = np.exp2(log2_weight - exponent)
     tables = []
-    for column in (diagonals.target, diagonals.source):
+    for place in (diagonals.entering, diagonals.leaving):
         weight = aligned_full(shape, 0.0, np.float32)
         weight_exponent = aligned_full(shape, kernels.ABSENT, np.int32)
-        weight[diagonals.diagonal, column] = mantissa
-        weight_exponent[diagonals.diagonal, column] = exponent
+        weight.ravel()[place] = mantissa
+        weight_exponent.ravel()[place] = exponent
         tables += [weight, weight_exponent]
     inverse_scale, scaled_mean, log_norm = (
         aligned_full((mean.shape[1], num_cells), 0.0, np.float64) for _ in range(3)
@@ -161,12 +159,16 @@ def _gaussians(chain: Chain) -> tuple[Any, ...]:
 
 
 class Rows(NamedTuple):
-    """A message and the emissions b_j(o_t) over some steps, in time order, all (T, G)."""
+    """A message and the emissions b_j(o_t) over some steps, in time order, all (T, G).
+
+    base: int64 (T,), the power of two that each step's message was divided by.
+    """
 
     mantissa: np.ndarray
     exponent: np.ndarray
     b: np.ndarray
     b_exponent: np.ndarray
+    base: np.ndarray
 
     def part(self, steps: slice) -> "Rows":
         """The rows of some of the steps."""
@@ -185,7 +187,8 @@ def _borrow_rows(num_steps: int, num_cells: int) -> Iterator[Rows]:
     arrays = (buffer[k * size : (k + 1) * size].reshape(num_steps, num_cells) for k in range(4))
     mantissa, exponent, b, b_exponent = arrays
     try:
-        yield Rows(mantissa.view(np.float32), exponent, b.view(np.float32), b_exponent)
+        base = np.empty(num_steps, np.int64)
+        yield Rows(mantissa.view(np.float32), exponent, b.view(np.float32), b_exponent, base)
     finally:
         if len(_spare) < 2 and buffer.nbytes <= _MAX_SPARE:
             _spare.append(buffer)
@@ -210,54 +213,59 @@ class _Message:
             aligned_full((2 * chain.num_cells,), 0.0, np.float32),
             aligned_full((2 * chain.num_cells,), 0, np.int32),
         )
-
-    def parts(self, block: slice) -> Iterator[tuple[slice, slice]]:
-        """Cut a block to fit the cache, in the message's order: steps, and steps in the block."""
-        for steps in _blocks(block, _CACHE_BLOCK, from_end=not self.is_forward):
-            yield steps, slice(steps.start - block.start, steps.stop - block.start)
+        self.normalizer = np.zeros(2)
 
     def advance(self, block: slice, rows: Rows) -> float:
         """Run the message through one block, from where it stands; returns the log base [nat]."""
-        return sum(self._advance(steps, rows.part(own)) for steps, own in self.parts(block))
-
-    def _advance(self, steps: slice, rows: Rows) -> float:
-        base, log_base = np.empty(len(rows.b)), 0.0
-        observations = self.observations[steps]
-        kernels.emission_rows(observations, *_gaussians(self.chain), rows.b, rows.b_exponent, base)
-        log_base = base.sum()
-        if self.is_forward and steps.start == 0:
-            log_base += self._begin(rows.part(slice(0, 1)))
-            rows = rows.part(slice(1, None))
-        elif not self.is_forward and steps.stop == len(self.observations):
-            log_base += self._begin(rows.part(slice(-1, None)))
-            rows = rows.part(slice(0, -1))
-        base = np.empty(len(rows.b), np.int64)
-        done = kernels.message_rows(
-            *self.last, rows.b, rows.b_exponent, *self.edges,
-            rows.mantissa, rows.exponent, base, not self.is_forward,
+        observations, log_base = self.observations[block], 0.0
+        if self.is_forward and block.start == 0:
+            log_base = self._begin(observations[:1], rows.part(slice(0, 1)))
+            observations, rows = observations[1:], rows.part(slice(1, None))
+        elif not self.is_forward and block.stop == len(self.observations):
+            log_base = self._begin(observations[-1:], rows.part(slice(-1, None)))
+            observations, rows = observations[:-1], rows.part(slice(0, -1))
+        log_base += kernels.advance_rows(
+            observations, *_gaussians(self.chain), *self.last, *self.edges, *rows,
+            not self.is_forward,
         )  # fmt: skip
-        if not done:
+        if np.isnan(log_base):
             raise ValueError(_UNREACHABLE)
-        return float(log_base + base.sum() * np.log(2.0))
+        return log_base
 
-    def _begin(self, row: Rows) -> float:
+    def _begin(self, observation: np.ndarray, row: Rows) -> float:
         """Write alpha_1 = pi b_1 (eq. 2), or b_T beta_T with beta_T = 1 (eq. 4); returns a base."""
+        base = np.empty(1)
+        kernels.emission_rows(observation, *_gaussians(self.chain), row.b, row.b_exponent, base)
         start = self.chain.initial_log if self.is_forward else self.chain.log_node
         with np.errstate(divide="ignore"):
             log_row = np.log(row.b, dtype=np.float64) + row.b_exponent * np.log(2.0) + start
-        base = kernels.split_row(log_row, row.mantissa, row.exponent)
+        base += kernels.split_row(log_row, row.mantissa, row.exponent)
         self.last[0][:] = np.tile(row.mantissa[0], 2)
         self.last[1][:] = np.tile(row.exponent[0], 2)
-        return float(base)
+        return float(base[0])
 
-    def cross(
-        self, other: Rows, smoothed: np.ndarray, counts: np.ndarray, counts_first_step: bool
-    ) -> float:
-        """Push the message across steps whose other message is known; see `crossing_rows`."""
-        return kernels.crossing_rows(
-            *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, *self.edges,
-            smoothed, counts, counts_first_step, not self.is_forward,
+    def meet(self, other: Rows) -> float:
+        """Begin to cross, at a row (1, G) of the other message; log2 of the two's joint sum."""
+        kernels.joint_sum(
+            *self.last, other.mantissa, other.exponent, *self.edges, self.normalizer
         )  # fmt: skip
+        if self.normalizer[0] == 0.0:  # the two halves share no live node
+            raise ValueError(_UNREACHABLE)
+        return float(np.log2(self.normalizer[0]) + self.normalizer[1])
+
+    def cross(self, other: Rows, counts: np.ndarray, counts_first_step: bool) -> np.ndarray:
+        """Push the message across steps whose other message is known; see `crossing_rows`.
+
+        Returns gamma (T, G), which takes the place of the other message's mantissas.
+        """
+        kernels.crossing_rows(
+            *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, other.base,
+            *self.edges, self.normalizer, other.mantissa, counts, counts_first_step,
+            not self.is_forward,
+        )  # fmt: skip
+        if not 0.0 < self.normalizer[0] < np.inf:  # the messages part within the steps
+            raise ValueError(_UNREACHABLE)
+        return other.mantissa
 
 
 class _Half:
@@ -269,7 +277,7 @@ class _Half:
         self.log_base = 0.0
         for block in _blocks(steps, len(rows.b), from_end=not message.is_forward):
             self.starts.append((block, tuple(array.copy() for array in message.last)))
-            self.log_base += message.advance(block, rows)
+            self.log_base += message.advance(block, rows.part(slice(0, block.stop - block.start)))
 
     def from_middle(self) -> Iterator[slice]:
         """Yield the blocks, the one nearest the middle first; earlier ones are run once more."""
@@ -279,7 +287,7 @@ class _Half:
         for block, last in reversed(self.starts):
             for array, start in zip(again.last, last, strict=True):
                 array[:] = start
-            again.advance(block, self.rows)
+            again.advance(block, self.rows.part(slice(0, block.stop - block.start)))
             yield block
 
 
@@ -287,7 +295,7 @@ class Expectations(NamedTuple):
     """What the E-step gathers (eqs. 7-10), by node; sums over the steps of one sequence.
 
     initial (N,): gamma_1. node (N,): sum of gamma_t. edge (E,): sum of xi_t, in the order of
-    `Diagonals.edge`. weight, first, second (N, D): sums of gamma_t, gamma_t o_t and gamma_t o_t^2
+    `Diagonals.slot`. weight, first, second (N, D): sums of gamma_t, gamma_t o_t and gamma_t o_t^2
     over the readings that are not NaN. log_likelihood [nat].
     """
 
@@ -320,8 +328,7 @@ def expectations(chain: Chain, diagonals: Diagonals, observations: np.ndarray) -
     return Expectations(
         initial[chain.cell],
         node,
-        edge[0][diagonals.diagonal, diagonals.target]
-        + edge[1][diagonals.diagonal, diagonals.source],
+        edge[0].ravel()[diagonals.entering] + edge[1].ravel()[diagonals.leaving],
         weight,
         first + weight * center,
         second + 2 * center * first + weight * center**2,
@@ -371,36 +378,50 @@ def _meet_in_the_middle(  # type: ignore[no-untyped-def]
     with (
         _borrow_rows(block, chain.num_cells) as past_rows,
         _borrow_rows(block, chain.num_cells) as future_rows,
-        ThreadPoolExecutor(2) as pool,
     ):
-        past, future = pool.map(
+        past, future = _both(
             _Half,
-            (forward, backward),
-            (slice(0, middle), slice(middle, num_steps)),
-            (past_rows, future_rows),
+            (forward, slice(0, middle), past_rows),
+            (backward, slice(middle, num_steps), future_rows),
         )
-        (edge_in, _, log2_joint), (edge_out, initial, _) = pool.map(
-            _cross_half, (forward, backward), (future, past), (visit, visit)
+        (edge_in, _, log2_joint), (edge_out, initial, _) = _both(
+            _cross_half, (forward, future, visit), (backward, past, visit)
         )
     log_likelihood = log2_joint * np.log(2.0) + past.log_base + future.log_base
     return np.stack([edge_in, edge_out]), initial, log_likelihood
 
 
+def _both(  # type: ignore[no-untyped-def]
+    work: Callable[..., Any], first: tuple[Any, ...], second: tuple[Any, ...]
+):
+    """Do two pieces of work, at once where the process has two cores; returns both results."""
+    if _num_cores() == 1:
+        return work(*first), work(*second)
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(work, *second)
+        return work(*first), other.result()
+
+
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[no-untyped-def]
     """Carry `message` across the half that the other thread has stored."""
     counts = np.zeros(message.chain.weight_in.shape)
-    buffer = aligned_empty((_CACHE_BLOCK, message.chain.num_cells), np.float32)
-    smoothed, log2_joint = buffer, None
+    smoothed, log2_joint = half.rows.mantissa, None
     for block in half.from_middle():
-        for steps, own in message.parts(block):
-            smoothed = buffer[: steps.stop - steps.start]
-            # Both messages take the step over the middle; the forward one counts it.
-            is_counted = message.is_forward or log2_joint is not None
-            first = message.cross(half.rows.part(own), smoothed, counts, is_counted)
-            if first == -np.inf:  # the two halves share no live node
-                raise ValueError(_UNREACHABLE)
-            log2_joint = first if log2_joint is None else log2_joint
-            visit(int(message.is_forward), steps, smoothed)
+        rows = half.rows.part(slice(0, block.stop - block.start))
+        # Both messages take the step over the middle; the forward one counts it.
+        is_counted = message.is_forward or log2_joint is not None
+        if log2_joint is None:
+            nearest = slice(0, 1) if message.is_forward else slice(-1, None)
+            log2_joint = message.meet(rows.part(nearest))
+        smoothed = message.cross(rows, counts, is_counted)
+        visit(int(message.is_forward), block, smoothed)
     return counts, smoothed[0].astype(np.float64), log2_joint
 
 
@@ -457,8 +478,9 @@ def start_filter(chain: Chain, belief: np.ndarray | None = None) -> FilterState:
     log_row = chain.log_node.copy()
     if belief is not None:
         log_row[chain.cell] = np.log(np.maximum(belief, 1e-300))
-    dtypes = (np.float32, np.int32, np.float32, np.int32)
-    rows = Rows(*(aligned_full((1, num_cells), 0, dtype) for dtype in dtypes))
+    floats = [aligned_full((1, num_cells), 0.0, np.float32) for _ in range(2)]
+    integers = [aligned_full((1, num_cells), 0, np.int32) for _ in range(2)]
+    rows = Rows(floats[0], integers[0], floats[1], integers[1], np.zeros(1, np.int64))
     kernels.split_row(log_row[None], rows.mantissa, rows.exponent)
     mantissa, exponent = (
         aligned_full((2 * num_cells,), 0, dtype) for dtype in (np.float32, np.int32)

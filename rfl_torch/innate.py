@@ -7,6 +7,7 @@ Actions are rows of numbers everywhere. A Discrete(n) space becomes n of them, e
 has one-hot rows, and the environment is given the largest (`env_action`).
 """
 
+import itertools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -56,6 +57,30 @@ class InnateController:
             self._action = np.clip(drawn.astype(np.float32), self.low, self.high)
         self._left -= 1
         return self._action
+
+
+def directions(action_dim: int) -> NDArray[np.float64]:
+    """Full actions to choose among, rows in [0, 1], (K, A).
+
+    In up to three dimensions all corners, edges and sides of the action space; else the two ends of
+    each dimension.
+    """
+    if action_dim <= 3:
+        rows = np.array(list(itertools.product((0.0, 0.5, 1.0), repeat=action_dim)))
+        return rows[(rows != 0.5).any(1)]
+    rows = np.full((2 * action_dim, action_dim), 0.5)
+    rows[np.arange(len(rows)), np.arange(len(rows)) // 2] = np.tile([0.0, 1.0], action_dim)
+    return rows
+
+
+def nearest_direction(
+    unit_actions: NDArray[np.floating],
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Which of the `directions` actions (T, A) point along, and whether they do so half-way out."""
+    offset = unit_actions - 0.5
+    ways = directions(offset.shape[1]) - 0.5
+    along = offset @ (ways / np.linalg.norm(ways, axis=1, keepdims=True)).T
+    return along.argmax(1), np.abs(offset).max(1) >= 0.25
 
 
 def record(

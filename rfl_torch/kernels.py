@@ -51,6 +51,9 @@ ABSENT = -(1 << 28)
 NEGLIGIBLE = 2.0**-100
 """Posterior below which a cell is left out of a step's sums: they lose at most T times this."""
 
+CACHED_STEPS = 512
+"""Steps whose emissions are evaluated before the message runs over them."""
+
 _FLAGS = {"contract", "nsz", "arcp"}  # never nnan/ninf: infinities and NaN keep their meaning
 
 _LN_2 = math.log(2.0)
@@ -58,8 +61,9 @@ _LOG2_E = 1.0 / _LN_2
 _ABSENT, _NOTHING = np.int32(ABSENT), np.int32(2 * ABSENT)  # int32: a Python int would widen
 _ZERO, _ONE, _NEGLIGIBLE = np.float32(0.0), np.float32(1.0), np.float32(NEGLIGIBLE)
 _SMALLEST, _BIAS, _SHIFT = np.int32(1), np.int32(127), np.int32(23)  # of a float32's exponent
+_FAINT = np.int32(127 - 116)  # a gamma of this exponent is under NEGLIGIBLE and set to zero:
+# denormal numbers would cost more than all the rest of the step
 _FRACTION, _EXPONENT = np.int32(0x7FFFFF), np.int32(0xFF)
-_TINY = np.float32(1e-30)
 _TAYLOR = tuple(np.float32(1.0 / math.factorial(n)) for n in range(7, 1, -1))
 
 
@@ -317,6 +321,38 @@ def message_rows(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
+def advance_rows(  # type: ignore[no-untyped-def]
+    observations, inverse_scale, scaled_mean, log_norm, log_node, power, mantissa, exponent,
+    shift, weight, weight_exponent, row, row_exponent, b, b_exponent, base, backward,
+):  # fmt: skip
+    """Do `emission_rows` and `message_rows` over a block, some steps at a time in the cache.
+
+    One call a block: threads that return to the interpreter in between wait for each other.
+    Returns the log base [nat] of the message; NaN if some step has no mass at all.
+    """
+    num_steps, log_base = len(row), 0.0
+    emission_base = np.empty(CACHED_STEPS)
+    num_parts = -(-num_steps // CACHED_STEPS)
+    for k in range(num_parts):
+        first = (num_parts - 1 - k if backward else k) * CACHED_STEPS
+        last = min(first + CACHED_STEPS, num_steps)
+        emission_rows(
+            observations[first:last], inverse_scale, scaled_mean, log_norm, log_node, power,
+            b[first:last], b_exponent[first:last], emission_base,
+        )  # fmt: skip
+        done = message_rows(
+            mantissa, exponent, b[first:last], b_exponent[first:last],
+            shift, weight, weight_exponent, row[first:last], row_exponent[first:last],
+            base[first:last], backward,
+        )  # fmt: skip
+        if not done:
+            return np.nan
+        for t in range(last - first):
+            log_base += emission_base[t] + base[first + t] * _LN_2
+    return log_base
+
+
+@njit(nogil=True, cache=True)
 def normalized_rows(row, row_exponent, out):  # type: ignore[no-untyped-def]
     """Write rows (T, G) as probabilities that sum to one; returns the last row's log2 sum."""
     num_steps, num_cells = row.shape
@@ -350,82 +386,124 @@ def _to_probabilities(product, exponent, first, top, out, t):  # type: ignore[no
 
 @njit(nogil=True, cache=True)
 def crossing_rows(  # type: ignore[no-untyped-def]
-    mantissa, exponent, b, b_exponent, other, other_exponent,
-    shift, weight, weight_exponent, smoothed, counts, counts_first_step, backward,
+    mantissa, exponent, b, b_exponent, other, other_exponent, other_base,
+    shift, weight, weight_exponent, normalizer, smoothed, counts, counts_first_step, backward,
 ):  # fmt: skip
     """Carry one message across a block whose other message is stored: gamma and sum of xi.
 
     At each step the message is pushed through the edges, gamma_t = pushed * other, and an edge's
-    share of gamma is its share of the push, so xi needs no product of its own:
+    share of gamma is its share of the push, so xi needs no normaliser of its own:
     xi_t(i, j) = gamma_t(c) * term[o, c] / total[c].
-    other (T, G): the stored rows. Forward: `other` = b_t beta_t rows and the emission enters after
-    gamma is formed; backward: `other` = alpha_t rows, last row first. `counts` (O, G) float64 is
-    added to, the block's first step only if `counts_first_step`.
-    Returns log2 of the first step's normaliser, sum of pushed * other: with the bases of both
-    messages it is the log-likelihood.
+    The normaliser, sum of pushed * other, is the same likelihood at every step but for the powers
+    of two that the rows were divided by, so a step takes the one before it and gamma is final
+    tile by tile; rows sum to one but for a step's rounding.
+    other (T, G), other_base (T,): the stored rows. Forward: `other` = b_t beta_t rows and the
+    emission enters after gamma is formed; backward: `other` = alpha_t rows, last row first.
+    smoothed (T, G): gamma; it may be `other` itself.
+    normalizer: float64 (2,), from `joint_sum` before the first block, carried on from there.
+    counts: float64 (O, G), added to, the block's first step only if `counts_first_step`.
     """
     num_steps, num_cells = smoothed.shape
-    totals, tops = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
-    joint, joint_exponent = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
     row, row_exponent = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
     part = aligned_row(weight.size, _ZERO)
     arriving = aligned_row(len(shift) * LANES, _ABSENT)
+    term = aligned_row(len(shift) * LANES, _ZERO)
     ahead = -num_cells if backward else num_cells
-    first_log2_sum = 0.0
+    joint, power = normalizer[0], np.int64(normalizer[1])
     for k in range(num_steps):
         t = num_steps - 1 - k if backward else k
-        top_of_row, top_of_joint = broadcast(_NOTHING), broadcast(np.int32(4 * ABSENT))
+        top_of_row, sums = broadcast(_NOTHING), broadcast(0.0)
+        factor, bottom = np.float32(1.0 / joint), np.int32(power - _BIAS)
         for c in range(0, num_cells, LANES):
             i = t * num_cells + c
             prefetch(b, i + ahead)
             prefetch(b_exponent, i + ahead)
             prefetch(other, i + ahead)
             prefetch(other_exponent, i + ahead)
-            top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
-            store(top, tops, c)
-            store(total, totals, c)
-            product = total * load(other, i)
-            is_there = greater(product, broadcast(_ZERO))
-            own = where(is_there, top + load(other_exponent, i), broadcast(np.int32(4 * ABSENT)))
-            store(product, joint, c)
-            store(own, joint_exponent, c)
-            top_of_joint = maximum(own, top_of_joint)
+            top, total = _gather_terms(
+                mantissa, exponent, shift, weight, weight_exponent, c, arriving, term
+            )
+            there = load(other, i)
+            own = where(
+                greater(there * total, broadcast(_ZERO)),
+                top + load(other_exponent, i) - bottom,
+                broadcast(_SMALLEST),
+            )
+            share = there * _power_of_two(own) * factor
+            share = where(greater(own, broadcast(_FAINT)), share, broadcast(_ZERO))
+            gamma = share * total
+            store(gamma, smoothed, i)
+            sums += widen(gamma)
+            if (k > 0 or counts_first_step) and any_lane(greater(gamma, broadcast(_NEGLIGIBLE))):
+                for o in range(len(shift)):
+                    j = o * num_cells + c
+                    store(load(part, j) + share * load(term, o * LANES), part, j)
             value, own = _normalize(total * load(b, i), top + load(b_exponent, i))
             store(value, row, c)
             store(own, row_exponent, c)
             top_of_row = maximum(own, top_of_row)
-        log2_sum = _to_probabilities(joint, joint_exponent, 0, largest(top_of_joint), smoothed, t)
-        first_log2_sum = log2_sum if k == 0 else first_log2_sum
-        if k > 0 or counts_first_step:
-            _count(mantissa, exponent, shift, weight_exponent, tops, totals, smoothed, t, part)
         if k % 64 == 63 or k == num_steps - 1:  # float32 sums stay short
-            _add_weighted(part, weight, counts)
-        _rebase(mantissa, exponent, largest(top_of_row), row, row_exponent, 0)
-    return first_log2_sum
+            _add_part(part, counts)
+        base = largest(top_of_row)
+        joint *= add_lanes(sums)
+        if joint == 0.0:
+            break
+        power += other_base[t] - base
+        _rebase(mantissa, exponent, base, row, row_exponent, 0)
+    normalizer[0], normalizer[1] = joint, power
 
 
-@njit(forceinline=True)
-def _count(mantissa, exponent, shift, weight_exponent, tops, totals, smoothed, t, part):  # type: ignore[no-untyped-def]
-    """Add a step's xi, short of the factor `weight`, to `part`, but where gamma is negligible."""
-    num_shifts, num_cells = len(shift), smoothed.shape[1]
+@njit(nogil=True, cache=True)
+def joint_sum(  # type: ignore[no-untyped-def]
+    mantissa, exponent, other, other_exponent, shift, weight, weight_exponent, normalizer
+):
+    """Sum of the pushed message times a row (1, G) of `other`, as normalizer[0] * 2**normalizer[1].
+
+    With the bases of both messages its log2 is the log-likelihood. 0 if no node is alive in both.
+    """
+    num_cells, lowest = other.shape[1], broadcast(np.int32(4 * ABSENT))
+    row, row_exponent = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
+    arriving = aligned_row(len(shift) * LANES, _ABSENT)
+    highest, sums = lowest, broadcast(0.0)
     for c in range(0, num_cells, LANES):
-        gamma = load(smoothed, t * num_cells + c)
-        if not any_lane(greater(gamma, broadcast(_NEGLIGIBLE))):
-            continue
-        bottom = load(tops, c) - _BIAS
-        ratio = gamma / maximum(load(totals, c), broadcast(_TINY))
-        for o in range(num_shifts):
-            source, i = load_one(shift, o) + c, o * num_cells + c
-            scale = _power_of_two(load(exponent, source) + load(weight_exponent, i) - bottom)
-            store(load(part, i) + ratio * (load(mantissa, source) * scale), part, i)
+        top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
+        product = total * load(other, c)
+        is_there = greater(product, broadcast(_ZERO))
+        own = where(is_there, top + load(other_exponent, c), lowest)
+        store(product, row, c)
+        store(own, row_exponent, c)
+        highest = maximum(own, highest)
+    power = largest(highest)
+    for c in range(0, num_cells, LANES):
+        scale = _power_of_two(load(row_exponent, c) - np.int32(power - _BIAS))
+        sums += widen(load(row, c) * scale)
+    normalizer[0], normalizer[1] = add_lanes(sums), power
 
 
 @njit(forceinline=True)
-def _add_weighted(part, weight, counts):  # type: ignore[no-untyped-def]
-    """Do counts += part * weight in float64, and empty `part`."""
+def _gather_terms(mantissa, exponent, shift, weight, weight_exponent, c, arriving, term):  # type: ignore[no-untyped-def]
+    """Do as `_gather`, and leave the summands, which add up to `total`, in `term`."""
+    num_shifts, num_cells = weight.shape
+    top = broadcast(_NOTHING)
+    for o in range(num_shifts):
+        own = load(exponent, load_one(shift, o) + c) + load(weight_exponent, o * num_cells + c)
+        store(own, arriving, o * LANES)
+        top = maximum(own, top)
+    total, bottom = broadcast(_ZERO), top - _BIAS
+    for o in range(num_shifts):
+        scale = _power_of_two(load(arriving, o * LANES) - bottom)
+        product = load(mantissa, load_one(shift, o) + c) * load(weight, o * num_cells + c)
+        product = product * scale
+        store(product, term, o * LANES)
+        total += product
+    return top, total
+
+
+@njit(forceinline=True)
+def _add_part(part, counts):  # type: ignore[no-untyped-def]
+    """Do counts += part in float64, and empty `part`."""
     for i in range(0, part.size, LANES):
-        product = widen(load(part, i)) * widen(load(weight, i))
-        store(load(counts, i) + product, counts, i)
+        store(load(counts, i) + widen(load(part, i)), counts, i)
         store(broadcast(_ZERO), part, i)
 
 

@@ -219,7 +219,8 @@ def run_stage(
         per_step = statistics.log_likelihood.item() / statistics.num_steps
         if not may_fall:
             watch.refuse_fall(iteration, temperature, per_step)
-        may_fall = bool((hmm.emission_scale < stage.min_scale * (1 - 1e-9)).any())
+        lowest = math.exp(hmm.emission_log_scale.detach().min().item())
+        may_fall = lowest < stage.min_scale * (1 - 1e-9)
         hmm.m_step(
             statistics,
             min_scale=stage.min_scale,
@@ -308,6 +309,7 @@ def partial_fit(
     observations: Sequences,
     memory: Statistics | None = None,
     forgetting: float = 1.0,
+    temperature: float = 1.0,
     **options: Any,
 ) -> Statistics:
     """Take one EM step on new observations and all that is remembered of earlier ones.
@@ -317,6 +319,7 @@ def partial_fit(
         observations: as for `GridHMM.e_step`.
         memory: what the call before returned.
         forgetting: weight of `memory`, 0 to 1; the memory's length is 1 / (1 - forgetting) calls.
+        temperature: power of the emission densities.
         options: for `GridHMM.m_step`.
 
     Returns:
@@ -324,7 +327,7 @@ def partial_fit(
     """
     if not 0 <= forgetting <= 1:
         raise ValueError(f"forgetting is {forgetting}, needs 0 to 1.")
-    statistics = hmm.e_step(observations)
+    statistics = hmm.e_step(observations, temperature)
     if memory is not None:
         statistics = memory.scaled(forgetting) + statistics
     hmm.m_step(statistics, **options)

@@ -7,11 +7,15 @@ every node to a goal, so that each control step can look its next node up.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
+from scipy.spatial import cKDTree
 
 ALIKE = 1.0
 """Nats of separation under which two nodes look alike."""
+
+PAIRS_AT_ONCE = 100_000
+"""Pairs of nodes compared in one go: their readings take tens of megabytes."""
 
 UNTRIED, REVERSED = 2.5, 10.0
 """Factors of an edge only ever taken the other way, in a reversible world and in another."""
@@ -47,13 +51,18 @@ def look_alikes(mean: NDArray[np.float64], scale: NDArray[np.float64], power: fl
     and a robot that is at one is at the other. So are truly different places that look the same:
     which it is shows when the plan over such a pair works out, or doesn't.
     """
-    rows = []
-    for node in range(len(mean)):
-        distance = (mean - mean[node]) ** 2 / (scale**2 + scale[node] ** 2)
-        is_alike = 0.5 * power * distance.sum(1) < ALIKE
-        is_alike[node] = False
-        rows.append(csr_array(is_alike[None]))
-    return csr_array(vstack(rows))
+    # No scale is above its reading's widest: pairs outside of this ball are told apart for sure.
+    widest = np.sqrt(2.0) * scale.max(0)
+    radius = np.sqrt(ALIKE / (0.5 * power)) * (1 + 1e-9)
+    pairs = cKDTree(mean / widest).query_pairs(radius, output_type="ndarray")
+    is_alike = np.zeros(len(pairs), bool)
+    for start in range(0, len(pairs), PAIRS_AT_ONCE):
+        i, j = pairs[start : start + PAIRS_AT_ONCE].T
+        distance = (mean[i] - mean[j]) ** 2 / (scale[i] ** 2 + scale[j] ** 2)
+        is_alike[start : start + PAIRS_AT_ONCE] = 0.5 * power * distance.sum(1) < ALIKE
+    i, j = pairs[is_alike].T
+    both = (np.concatenate([i, j]), np.concatenate([j, i]))
+    return csr_array((np.ones(len(both[0]), bool), both), shape=(len(mean), len(mean)))
 
 
 def reachability_path(graph: csr_array, start: int, goal: int) -> list[int]:

@@ -65,6 +65,14 @@ def test_online_times_a_step_of_an_agent_that_keeps_all_its_nodes(capsys):
     assert "Executor.act, N = 16" in out
 
 
+def test_fleet_times_a_job_of_one_without_torchrun(monkeypatch, capsys):
+    monkeypatch.delenv("RANK", raising=False)
+    benchmark.main(benchmark.Fleet(num_steps=60, sides=(4,)))
+    out = capsys.readouterr().out
+    assert "1 rank(s), T = 60 each" in out
+    assert " 11152 " in out  # 8 (16 (2 + 13 + 72) + 2) bytes
+
+
 def test_em_times_the_engine_against_two_matrix_products(monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "PEERS", {})
     monkeypatch.setattr(benchmark, "print_scaling", lambda config: None)

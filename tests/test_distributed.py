@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import torch
 from rfl_torch import distributed, learning
 from rfl_torch.distributed import Rank
 from rfl_torch.hmm import GridHMM
+
+HERE = Path(__file__).resolve().parent
 
 STAGES = (
     learning.Stage(2, 4, temperature=(0.2, 1.0), pseudo_count=0.1, all_phases=True),
@@ -61,7 +64,7 @@ def torchrun(folder, *arguments):
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     return subprocess.run(
         [*command, script, folder, *arguments],
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": __file__.rpartition("/")[0]},
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{HERE}:{HERE.parent}"},
         capture_output=True,
         text=True,
         timeout=100,
@@ -113,3 +116,16 @@ def test_without_torchrun_the_job_is_one_process(monkeypatch):
     learning.start(alone, logs, "data", seed=0)
     learning.learn(alone, logs, STAGES[:1])
     assert all(torch.equal(a, b) for a, b in zip(hmm.parameters(), alone.parameters(), strict=True))
+
+
+def test_an_iteration_sums_the_bytes_that_the_formula_says(monkeypatch):
+    """Counted where the ranks' tensors are summed, over every iteration of a job of one."""
+    summed = []
+    monkeypatch.setattr(distributed.dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(distributed.dist, "broadcast", lambda tensor, src: None)
+    monkeypatch.setattr(distributed.dist, "all_reduce", lambda tensor: summed.append(tensor.nbytes))
+    hmm = GridHMM((4, 5), 3)
+    record = distributed.learn(hmm, make_logs(), STAGES[:1])
+    num_nodes, num_edges = hmm.successor.shape
+    assert summed == [distributed.bytes_reduced(num_nodes, num_edges, 3)] * len(record)
+    assert len(record) == 4

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from rfl_torch.planner import cost_to_go, largest_component, reachability_path, threshold_graph
+from rfl_torch.planner import (
+    ALIKE,
+    cost_to_go,
+    largest_component,
+    look_alikes,
+    reachability_path,
+    threshold_graph,
+)
 
 
 def propagate(adjacency, start, goal):
@@ -61,3 +68,23 @@ def test_the_largest_component_needs_a_way_there_and_back():
     adjacency = np.zeros((5, 5))
     adjacency[0, 1] = adjacency[1, 2] = adjacency[2, 0] = adjacency[2, 3] = adjacency[3, 4] = 1
     assert largest_component(csr_array(adjacency)).tolist() == [True] * 3 + [False] * 2
+
+
+@pytest.mark.parametrize("decades", [(0.0, 0.0), (-0.3, 0.3), (-2.0, 1.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_look_alikes_are_the_pairs_of_the_definition(decades, seed, monkeypatch):
+    """By every pair in a loop; scales equal or not, means about as far apart as they are."""
+    monkeypatch.setattr("rfl_torch.planner.PAIRS_AT_ONCE", 70)  # several chunks
+    rng = np.random.default_rng(seed)
+    scale = 10 ** rng.uniform(*decades, (60, 3))
+    mean = 3 * rng.standard_normal((60, 3)) * 10 ** rng.uniform(-1, 0, (60, 1))
+    power = 0.3
+    expected = np.zeros((60, 60), bool)
+    for i, j in itertools.permutations(range(60), 2):
+        distance = (mean[i] - mean[j]) ** 2 / (scale[i] ** 2 + scale[j] ** 2)
+        expected[i, j] = 0.5 * power * distance.sum() < ALIKE
+    found = look_alikes(mean, scale, power)
+    assert found.dtype == bool
+    assert 100 < expected.sum() < 60 * 59
+    np.testing.assert_array_equal(found.toarray(), expected)
+    assert look_alikes(100.0 * np.eye(3), np.full((3, 3), 0.1), power).nnz == 0

@@ -1,0 +1,111 @@
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from test_growth import covered, half_log
+from worlds import DotWorld, dot_config, dot_log
+
+from rfl_torch import Agent
+from rfl_torch.innate import nearest_direction
+from rfl_torch.practice import Goals, Strategy, untried
+
+
+class Recorder(DotWorld):
+    """Keeps count of steps, and ends an episode every `length` of them."""
+
+    def __init__(self, length=10**9):
+        super().__init__()
+        self.length, self.steps, self.resets = length, 0, 0
+
+    def reset(self, **kwargs):
+        self.resets += 1
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        assert (np.abs(action) <= 1.0).all()
+        self.steps += 1
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, self.steps % self.length == 0, False, info
+
+
+@pytest.fixture(scope="module")
+def half_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("practice") / "half.safetensors"
+    Agent(dot_config()).fit(half_log()).save(path)
+    return path
+
+
+def test_frontier_practice_takes_the_map_from_half_of_the_square_to_all_of_it(half_path):
+    agent = Agent.load(half_path)
+    log = dot_log(1500, seed=5)
+    assert covered(agent, half_log(9)) < 0.7
+    agent.practice(DotWorld(), 2000)
+    assert covered(agent, log) > 0.95
+
+
+@pytest.mark.parametrize("strategy", get_args(Strategy))
+def test_practice_takes_exactly_the_steps_it_was_given_and_learns_from_all(half_path, strategy):
+    agent = Agent.load(half_path)
+    before, world = agent.edges.sum(), Recorder()
+    history = agent.practice(world, 700, strategy=strategy)
+    assert (world.steps, world.resets) == (700, 1)
+    assert agent.edges.sum() == before + 700
+    starts = [attempt.step for attempt in history]
+    assert starts == sorted(set(starts))
+    assert all(0 <= attempt.goal < agent.num_nodes for attempt in history)
+
+
+def test_no_transition_is_learned_across_the_end_of_an_episode(half_path):
+    agent = Agent.load(half_path)
+    before, world = agent.edges.sum(), Recorder(length=40)
+    agent.practice(world, 400)
+    assert world.resets == 1 + 400 // 40
+    assert agent.edges.sum() == before + 400
+
+
+def test_practice_is_the_same_for_the_same_seed(half_path):
+    first, again, other = (Agent.load(half_path) for _ in range(3))
+    history = first.practice(DotWorld(), 600, seed=1)
+    assert again.practice(DotWorld(), 600, seed=1) == history
+    assert other.practice(DotWorld(), 600, seed=2) != history
+
+
+def test_a_direction_is_untried_until_it_was_taken_or_a_neighbour_lies_there(half_path):
+    agent = Agent.load(half_path)
+    is_open = untried(agent)
+    assert (agent.tried[is_open] < 5).all()
+    mean = agent.hmm.emission_mean.detach().float()
+    graph = agent.graph.tocoo()
+    inputs = torch.cat([mean[graph.row], mean[graph.col]], 1)
+    with torch.no_grad():
+        way, _ = nearest_direction(agent.bank(inputs, torch.from_numpy(graph.col).long()).numpy())
+    assert not is_open[graph.row, way].any()
+    agent.tried[:] = 0
+    none_tried = untried(agent)
+    agent.tried[:] = 99
+    assert none_tried.any()
+    assert not untried(agent).any()
+
+
+def test_each_strategy_takes_the_node_it_promises(half_path):
+    agent = Agent.load(half_path)
+    rng = np.random.default_rng(0)
+    assert agent.visits[Goals(agent, "least_visited", rng).choose(0)] == agent.visits.min()
+    progress = Goals(agent, "progress", rng)
+    progress.note(3, True)
+    assert progress.choose(0) == 3
+    frontier = Goals(agent, "frontier", rng)
+    frontier.untried[:] = False
+    frontier.untried[5, 0] = True
+    assert frontier.choose(0) == 5
+    assert frontier.try_out(5) == 0
+    assert frontier.try_out(5) is None
+    assert len({Goals(agent, "random", rng).choose(0) for _ in range(50)}) > 5
+
+
+def test_a_grid_map_can_be_practised_with_too():
+    agent = Agent(dot_config(repairs=False)).fit(dot_log(800, seed=1))
+    before = agent.edges.sum()
+    agent.practice(DotWorld(), 300)
+    assert agent.edges.sum() == before + 300
