@@ -100,9 +100,11 @@ def test_a_kidnapped_robot_is_elsewhere_and_still_arrives(drive):
     drive.go_to(node)
     for _ in range(5):
         drive.tick()
-    before = drive.truth
-    drive.kidnap()
-    assert np.linalg.norm(drive.truth - before) > 1.0
+    for _ in range(10):  # some of the places lie on its way
+        before = drive.truth
+        drive.kidnap()
+        assert np.linalg.norm(drive.truth - before) > 1.0
+        drive.go_to(node) if drive.status == "reached" else drive.tick()
     drive_until(drive, lambda: drive.status == "reached")
     assert "kidnapped" in texts(drive)
     assert any(text.startswith("re-planned") for text in texts(drive))
