@@ -4,7 +4,7 @@ The loop behind `experiments.live`, one control step a `tick`, without anything 
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -20,9 +20,6 @@ UNSURE = 0.3
 
 TRAIL = 150
 """Steps of the way gone that are kept."""
-
-PRACTICE_PIECE = 200
-"""Practice can be ended after so many steps."""
 
 
 class Event(NamedTuple):
@@ -96,11 +93,12 @@ class Drive:
         """Let the agent choose goals and learn from going there; blocks until it is done."""
         before = self.agent.num_nodes
         self._tell(f"practising for {num_steps} steps")
+        self._wait()
         self.practice_share = 0.0
         watched = Watched(self.env, self)
         try:
             self._seed += 1
-            self.agent.practice(watched, num_steps, seed=self._seed)
+            self.agent.practice(watched, num_steps, seed=self._seed, progress=self._count)
         finally:
             self.practice_share = None
             log = watched.log()
@@ -161,6 +159,11 @@ class Drive:
         """Lay the map out: by ground truth where the logs have one, else from the graph."""
         self.place, self.is_true_place = scoring.node_places(self.agent, self.logs, self.world)
         self.map_version += 1
+
+    def _count(self, steps: range) -> Iterator[int]:
+        for step in steps:
+            self.practice_share = step / len(steps)
+            yield step
 
     def _wait(self) -> None:
         """Go nowhere, and keep recognising."""
@@ -224,6 +227,7 @@ class Watched(gym.Wrapper):
         self._truths.append(info.get("ground_truth"))
         self._drive.num_steps += 1
         self._drive._sense(observation, info)
+        self._drive.executor.act(observation)  # it goes nowhere, and recognises what is seen
         return observation, float(reward), terminated, truncated, info
 
     def log(self) -> Trajectory | None:

@@ -164,9 +164,7 @@ def build_page(drive: Drive, config: Config) -> None:
                 badge.props('id="status"')
                 where = ui.label().classes("text-body1").props('id="where"')
                 going = ui.label().classes("text-body1").props('id="going"')
-                ui.linear_progress(show_value=False).bind_visibility_from(
-                    drive, "practice_share", lambda share: share is not None
-                ).props("indeterminate")
+                practised = ui.linear_progress(show_value=False)
             with ui.row():
                 pause = ui.button("Pause", icon="pause", on_click=drive.toggle_pause)
                 kidnap = ui.button("Kidnap", icon="back_hand", on_click=drive.kidnap)
@@ -197,6 +195,8 @@ def build_page(drive: Drive, config: Config) -> None:
         going.set_text(describe_way(drive))
         pause.set_text("Go on" if drive.is_paused else "Pause")
         is_free = drive.practice_share is None
+        practised.set_visibility(not is_free)
+        practised.set_value(drive.practice_share or 0.0)
         for button in (pause, kidnap, practise):
             button.set_enabled(is_free)
         new = min(drive.num_events - shown["event"], len(drive.events))
@@ -246,7 +246,7 @@ def chart_options(drive: Drive) -> dict[str, Any]:
     known = _known(drive)
     low, high = chart_limits(drive)
     edges = np.stack(scoring.planning_graph(drive.agent).nonzero(), 1)
-    lines = drive.place[edges]
+    lines = drive.place[edges[(edges < len(drive.place)).all(1)]]  # practice adds nodes
     lines = lines[np.isfinite(lines).all((1, 2))]
     walls = np.zeros((0, 2, 2))
     if drive.world is scoring.MAZE and drive.is_true_place:

@@ -29,6 +29,10 @@ _CACHE_BLOCK = 512
 _MAX_ENTRIES = 20_000_000
 """Steps times cells that a block holds at most, whatever BLOCK says; an entry takes 16 bytes."""
 
+_SHORT = 200_000
+"""Steps times cells of a sequence that one thread does sooner than two: starting one has a price,
+which a log of many short episodes pays for each."""
+
 _MAX_SPARE = 1 << 29
 """Bytes of one working buffer that are kept for the next call: fresh pages cost a tenth of it."""
 
@@ -368,6 +372,7 @@ def _meet_in_the_middle(  # type: ignore[no-untyped-def]
     Returns expected counts by target and by source cell, (2, O, G); gamma_1; the log-likelihood.
     """
     num_steps, shape = len(observations), chain.weight_in.shape
+    is_alone = num_steps * chain.num_cells < _SHORT or _num_cores() == 1
     if num_steps == 1:
         gamma, log_likelihood = filter_rows(chain, observations)
         visit(0, slice(0, 1), gamma)
@@ -380,22 +385,23 @@ def _meet_in_the_middle(  # type: ignore[no-untyped-def]
         _borrow_rows(block, chain.num_cells) as future_rows,
     ):
         past, future = _both(
+            is_alone,
             _Half,
             (forward, slice(0, middle), past_rows),
             (backward, slice(middle, num_steps), future_rows),
         )
         (edge_in, _, log2_joint), (edge_out, initial, _) = _both(
-            _cross_half, (forward, future, visit), (backward, past, visit)
+            is_alone, _cross_half, (forward, future, visit), (backward, past, visit)
         )
     log_likelihood = log2_joint * np.log(2.0) + past.log_base + future.log_base
     return np.stack([edge_in, edge_out]), initial, log_likelihood
 
 
 def _both(  # type: ignore[no-untyped-def]
-    work: Callable[..., Any], first: tuple[Any, ...], second: tuple[Any, ...]
+    is_alone: bool, work: Callable[..., Any], first: tuple[Any, ...], second: tuple[Any, ...]
 ):
-    """Do two pieces of work, at once where the process has two cores; returns both results."""
-    if _num_cores() == 1:
+    """Do two pieces of work, at once unless `is_alone`; returns both results."""
+    if is_alone:
         return work(*first), work(*second)
     with ThreadPoolExecutor(1) as pool:
         other = pool.submit(work, *second)

@@ -3,7 +3,7 @@
 tensorboard --logdir runs
 
     hmm/, time/     scalars of each EM iteration
-    map/graph       the graph of transitions while it unfolds
+    map/graph       the graph of transitions while it unfolds; the last one is what is acted on
     controllers/    loss of the controllers, once they are learned
     practice/       coverage, success and surprise of goals chosen by the agent
     execute/        success of goals given to it, by their kind
@@ -91,22 +91,22 @@ class TensorBoardMonitor:
             self.image("map/graph", picture, self._iteration)
 
     def nodes(self, hmm: GridHMM, num_steps: NDArray[np.int64]) -> None:
-        """Write the nodes' mean readings for the projector, which shows them in three dimensions.
+        """Write the map that came of it all: its picture, and the nodes for the projector.
 
         Args:
             hmm: the learned map.
-            num_steps: (N,) steps of the log in each node, a label beside its number and cell.
+            num_steps: (N,) steps of the log in each node, a label beside its number.
         """
-        cell = np.stack(np.unravel_index(hmm.cell.numpy(), hmm.shape), 1)
-        axes = [f"axis {i}" for i in range(cell.shape[1])]
+        self._map(hmm)
+        neighbours = (_symmetric_graph(hmm) > 0).sum(1)
         labels = [
-            [str(value) for value in (node, *own, steps)]
-            for node, (own, steps) in enumerate(zip(cell.tolist(), num_steps, strict=True))
+            [str(value) for value in row]
+            for row in zip(range(hmm.num_nodes), num_steps, neighbours, strict=True)
         ]
         self._writer.add_embedding(
             hmm.emission_mean.detach(),
             metadata=labels,
-            metadata_header=["node", *axes, "steps of the log"],
+            metadata_header=["node", "steps of the log", "neighbours"],
             tag="nodes",
         )
 

@@ -210,7 +210,7 @@ def practice(
         node = executor.node
         attempt = Attempt(begin, goal, on_way, reached, agent.num_nodes, unknown / max(1, on_way))
         history.append(attempt)
-        _report(monitor, history, run.done)
+        _report(monitor, strategy, history, run.done)
         if run.pending >= LEARN_EVERY or run.left == 0:
             agent.partial_fit(run.take_logs(*agent.action_bounds))
             goals.update()
@@ -243,10 +243,16 @@ def _look_around(
             left -= executor.is_familiar
 
 
-def _report(monitor: PracticeMonitor | None, history: list[Attempt], step: int) -> None:
+def _report(
+    monitor: PracticeMonitor | None, strategy: Strategy, history: list[Attempt], step: int
+) -> None:
     if monitor is None:
         return
     recent = history[-20:]
-    monitor.scalar("practice/success_rate", float(np.mean([x.reached for x in recent])), step)
-    monitor.scalar("practice/surprise", float(np.mean([x.surprise for x in recent])), step)
-    monitor.scalar("practice/nodes", recent[-1].num_nodes, step)
+    values = {
+        "success_rate": float(np.mean([x.reached for x in recent])),
+        "surprise": float(np.mean([x.surprise for x in recent])),
+        "nodes": recent[-1].num_nodes,
+    }
+    for name, value in values.items():
+        monitor.scalar(f"practice/{name}/{strategy}", value, step)

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from experiments import cli, execute, record, reproduce, scoring, train
+from experiments import cli, execute, practice, record, reproduce, scoring, train
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory
 
 PENDULUM = "rfl/TorquePendulum-v0"
@@ -103,6 +103,20 @@ def test_execute_without_the_log_knows_places_but_no_nodes(tmp_path, model, caps
     assert "unknown" in nodes
     assert "unknown" not in places
     assert list((tmp_path / "tb").iterdir())
+
+
+def test_practice_learns_more_and_tells_by_strategy(tmp_path, model, capsys):
+    out = tmp_path / "practised.safetensors"
+    config = practice.Config(model, out, num_steps=120, strategy="random", logdir=tmp_path / "tb")
+    practice.main(config)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith(f"{out}: {Agent.load(model).num_nodes} nodes before, ")
+    assert lines[-1].endswith(f"{Agent.load(out).num_nodes} now")
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(config.logdir))
+    events.Reload()
+    names = {f"practice/{name}/random" for name in ("success_rate", "surprise", "nodes")}
+    assert set(events.Tags()["scalars"]) == names
 
 
 def test_execute_goes_to_one_goal(model, capsys):

@@ -24,6 +24,7 @@ PAGES = ["method", "choosing", "figures", "failures", "robot"]
 SMALLER = {
     "record": ["--num-steps", "400"],
     "train": ["--side", "5"],
+    "practice": ["--num-steps", "60"],
     "execute": ["--trials", "2", "--limit", "10"],
     "reproduce": ["--trials", "1", "--num-steps", "200"],
 }

@@ -73,9 +73,11 @@ def test_nodes_are_written_for_the_projector_with_labels(tmp_path):
     )
     (labels,) = tmp_path.rglob("metadata.tsv")
     rows = [line.split("\t") for line in labels.read_text().splitlines()]
-    assert rows[0] == ["node", "axis 0", "axis 1", "steps of the log"]
-    assert rows[2] == ["1", "0", "2", "10"]  # cell 1 was dropped: node 1 is at row 0, column 2
-    assert len(rows) == 6
+    assert rows[0] == ["node", "steps of the log", "neighbours"]
+    assert rows[1][:2] == ["0", "0"]
+    assert rows[5][:2] == ["4", "40"]
+    degree = monitor._symmetric_graph(hmm).toarray().astype(bool).sum(1)
+    assert [int(row[2]) for row in rows[1:]] == degree.tolist()
     assert len(list(tmp_path.glob("events*"))) == 1
     assert "nodes" in (tmp_path / "projector_config.pbtxt").read_text()
 

@@ -45,7 +45,7 @@ class Says:
 
     def __init__(self, status="reached", after=3):
         self.goal, self.status, self.node, self.path = 0, "running", 0, []
-        self._says, self._left = status, after
+        self._says, self._left, self.reason = status, after, ""
 
     def act(self, observation):
         self._left -= 1
@@ -55,7 +55,12 @@ class Says:
 
 
 def agent_saying(status, after=3):
-    return SimpleNamespace(executor=lambda goal, seed: Says(status, after))
+    return SimpleNamespace(
+        executor=lambda goal, seed: Says(status, after),
+        normalize=lambda observation: observation,
+        log_emission=lambda normal: np.zeros(1),
+        least_familiar=-1.0,
+    )
 
 
 def trial(status, is_true, num_steps=5):
@@ -283,12 +288,14 @@ def test_independent_tasks_start_at_their_own_place():
     assert [t.outcome.trace[0, 0] for t in trials] == [70, 30]
 
 
-def test_world_without_ground_truth_gives_belief_alone():
+def test_world_without_ground_truth_is_judged_by_the_last_observation():
+    """The robot is at 20 after each task's two actions, the goal's mean at 20.04: 0.05 is near."""
+    agent = agent_saying("reached")
+    agent.hmm = SimpleNamespace(emission_mean=torch.tensor([[20.04]]))
     tasks = [Task(0, None)] * 2
-    trials = list(
-        scoring.run_tasks(Line(is_told=False), agent_saying("reached"), tasks, None, None, 0)
-    )
-    assert [t.is_true for t in trials] == [None, None]
+    trials = list(scoring.run_tasks(Line(is_told=False), agent, tasks, None, None, 0))
+    assert [t.outcome.observation.item() for t in trials] == [20.0, 40.0]
+    assert [t.is_true for t in trials] == [True, False]
     assert math.isnan(trials[0].outcome.path_length)
 
 
