@@ -1,8 +1,9 @@
-"""Time this engine, and other libraries on the same arrays in the same run.
+"""Measure this engine and these agents, and others on the same data in the same run.
 
 python -m experiments.benchmark em             one EM iteration against the other libraries
 python -m experiments.benchmark em --full      up to a million steps, and the paper's schedule
 python -m experiments.benchmark online         one control step, at 400 and at 10,000 nodes
+python -m experiments.benchmark reach          places reached by this method and by peers
 torchrun --standalone --nproc-per-node 2 -m experiments.benchmark fleet      what ranks cost
 
 Seconds are the process's own on one core, and by the wall on several; the best of some runs. A
@@ -26,6 +27,7 @@ import torch
 import tyro
 
 from experiments import cli
+from experiments.reach import Reach, benchmark_reach
 from rfl_torch import Agent, AgentConfig, Trajectory, distributed, inference, learning
 from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.planner import largest_component
@@ -78,6 +80,7 @@ Config = (
     Annotated[Em, tyro.conf.subcommand("em")]
     | Annotated[Online, tyro.conf.subcommand("online")]
     | Annotated[Fleet, tyro.conf.subcommand("fleet")]
+    | Annotated[Reach, tyro.conf.subcommand("reach")]
 )
 
 
@@ -89,8 +92,11 @@ class Job:
     observations: torch.Tensor
 
 
-def main(config: Em | Online | Fleet) -> None:
+def main(config: Em | Online | Fleet | Reach) -> None:
     """Run one of the benchmarks on so many cores."""
+    if isinstance(config, Reach):
+        benchmark_reach(config)
+        return
     if isinstance(config, Fleet):
         benchmark_fleet(config)
         return

@@ -206,6 +206,19 @@ def draw_execution(
     _finish(figure, path)
 
 
+def draw_calibration(path: Path, nominal: Array, held: dict[int, Array]) -> None:
+    """Draw how many readings central forecast intervals hold, by steps ahead."""
+    figure = Figure(figsize=(WIDTH / 2, WIDTH / 2), layout="constrained")
+    axes = figure.add_subplot(
+        xlabel="probability of the interval", ylabel="readings inside", aspect="equal"
+    )
+    axes.plot([0, 1], [0, 1], color=INK, lw=0.8, ls=":")
+    for colour, (steps, share) in zip((BLUE, RED, GREEN, PURPLE), held.items(), strict=False):
+        axes.plot(nominal, share, color=colour, label=f"{steps} steps ahead")
+    axes.spines[["top", "right"]].set_visible(False)
+    _finish(figure, path)
+
+
 def draw_success_curve(
     path: Path,
     curves: dict[str, tuple[Array, Array, Array, Array]],

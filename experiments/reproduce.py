@@ -358,7 +358,21 @@ def draw_maze(out: Path, env: gym.Env, log: Trajectory, runs: dict[str, Run]) ->
         figures.draw_attractors(new, panels, walls)
     trial = execute.best_trial(run.trials[CHAINED_NODES])
     _draw_execution(out / "figure_9_execution.png", run, trial, walls)
+    draw_calibration(out / "calibration.png", run.agent, record_log(env, *FRESH_LOG))
     execute.animate(out / "execution.gif", env, run.agent, trial, run.table)
+
+
+FRESH_LOG = (2000, 3, 1_000_000)
+"""Steps, hold and seed of the log that forecasts are compared with."""
+
+
+def draw_calibration(path: Path, agent: Agent, log: Trajectory) -> None:
+    """Draw how often readings fall inside the intervals forecast for them."""
+    rng, nominal = np.random.default_rng(0), np.linspace(0.0, 1.0, 21)
+    ranks = scoring.forecast_ranks(agent, log, (1, 5, 20), 300, rng)
+    held = {steps: scoring.held_shares(rows, nominal) for steps, rows in ranks.items()}
+    with cli.replacing(path) as new:
+        figures.draw_calibration(new, nominal, held)
 
 
 def draw_pendulum(out: Path, env: gym.Env, log: Trajectory, runs: dict[str, Run]) -> None:

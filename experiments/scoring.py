@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
-from rfl_torch import Agent, InnateController, Trajectory
+from rfl_torch import Agent, InnateController, Trajectory, inference
 from rfl_torch.monitor import map_layout
 from rfl_torch.planner import largest_component, threshold_graph
 
@@ -220,6 +221,45 @@ def velocity_r2(table: NodeTable, nodes: NDArray[np.int64], truth: Array) -> flo
 def _rms(values: Array, count: NDArray[np.int64]) -> float:
     active = count > 0
     return float(np.sqrt(np.average(values[active] ** 2, weights=count[active])))
+
+
+# -- prediction --------------------------------------------------------------------------------
+
+
+def forecast_ranks(
+    agent: Agent, log: Trajectory, ahead: Sequence[int], num: int, rng: Rng
+) -> dict[int, Array]:
+    """Where observations fall in their forecasts, {steps ahead: (num, D)}.
+
+    A forecast is the mixture of the nodes' Gaussians under the belief so many steps on. The rank of
+    a reading is its cumulative probability: uniform on [0, 1], if forecasts are as sure as right.
+
+    Args:
+        agent: whose map forecasts, from the filtered belief.
+        log: fresh, at the rate of the agent's control steps.
+        ahead: steps ahead.
+        num: times that forecasts are made at.
+        rng: draws them.
+    """
+    observations = agent.normalize(log.observations)
+    beliefs = inference.filter_rows(agent.chain, observations)[0][:, agent.chain.cell]
+    times = rng.choice(len(observations) - max(ahead), num, replace=False)
+    mean = agent.hmm.emission_mean.detach().numpy()
+    scale = agent.hmm.emission_scale.detach().numpy()
+    ranks: dict[int, list[Array]] = {steps: [] for steps in ahead}
+    for t in times:
+        forecast = agent.hmm.forecast(torch.from_numpy(beliefs[t]).double(), max(ahead))
+        for steps in ahead:
+            weight = forecast[steps - 1].detach().numpy()
+            below = norm.cdf((observations[t + steps] - mean) / scale)
+            ranks[steps].append(weight @ below)
+    return {steps: np.stack(rows) for steps, rows in ranks.items()}
+
+
+def held_shares(ranks: Array, nominal: Array) -> Array:
+    """Share of ranks inside central intervals of the given probabilities."""
+    away = 2 * np.abs(ranks[np.isfinite(ranks)] - 0.5)
+    return np.array([(away <= share).mean() for share in nominal])
 
 
 # -- tasks ------------------------------------------------------------------------------------

@@ -49,11 +49,14 @@ UNFAMILIAR_SHARE = 0.001
 STRANGE_GOAL = 4.0
 """Radii of a look beyond which a goal is no place that the agent knows."""
 
-HOP_PROBABILITY = 0.05
+HOP_PROBABILITY = 0.005
 """Chance a step that the belief changes over to a node that looks the same."""
 
 MOST_SAMPLES = 256
 """Triplets a node that are kept to learn from again when more come."""
+
+MOST_ROUNDS = 8
+"""Times that a repaired map is counted and its logs recognised anew, until all nodes are used."""
 
 MIN_STEPS = 10
 """Shortest log that is accepted: the coarsest stage still needs a few steps."""
@@ -83,6 +86,8 @@ class Agent:
     """Mean absolute difference of normalised observations within which places look the same."""
     samples: Triplets
     """What the controllers learned from: the latest of each node."""
+    last_seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    """Normalised observation (D,) and belief (N,) of the last control step."""
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
     least_familiar: float
@@ -93,6 +98,7 @@ class Agent:
         self.seed = seed
         self.record: list[learning.Progress] = []
         self.counts = self.statistics = None
+        self.last_seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     # -- learning ---------------------------------------------------------------------------
 
@@ -130,6 +136,19 @@ class Agent:
             self._learn_controllers(logs, observations, paths, monitor)
         else:
             self.statistics = self.hmm.e_step(observations, power)
+        return self
+
+    def learn_from_labels(self, logs: list[Trajectory], nodes: list[NDArray[np.int64]]) -> "Agent":
+        """Take labelled logs for the map's nodes, as from an oracle, and learn controllers.
+
+        Args:
+            logs: what `fit` learned the spaces from.
+            nodes: of every observation of each log, int64 (T+1,).
+        """
+        observations = [self.normalize(log.observations) for log in logs]
+        paths = [torch.from_numpy(path) for path in self._count(nodes, observations)]
+        self._prepare_recognition()
+        self._learn_controllers(logs, [torch.from_numpy(x) for x in observations], paths, None)
         return self
 
     def partial_fit(self, logs: Trajectory | list[Trajectory]) -> "Agent":
@@ -196,8 +215,9 @@ class Agent:
         num_nodes = self.num_nodes
         if self.counts is not None:
             rows = inference.log_emission(self.chain, observations)[:, self.chain.cell]
-            path = growth.recognize(self.hmm, rows, self.least_familiar)
             seen = np.where(np.isnan(observations), self._mean[rows.argmax(1)], observations)
+            unknown = growth.log_unknown(rows, seen, self._mean, self.look_radius)
+            path = growth.recognize(self.hmm, rows, unknown)
             path = growth.add_looks(path, seen, self.look_radius, num_nodes)
             num_nodes = max(num_nodes, int(path.max()) + 1)
             more = repair.Counts.of([path], [observations], num_nodes)
@@ -309,18 +329,21 @@ class Agent:
         looks = np.split(pooled_looks, np.cumsum([len(part) for part in seen])[:-1])
         nodes = repair.split_by_place(looks, [path.numpy() for path in paths])
         values = [sequence.numpy() for sequence in observations]
-        for is_last in (False, True):
-            nodes, num_nodes = repair.number_anew(nodes)
-            self.counts = repair.Counts.of(nodes, values, num_nodes)
-            self._rebuild()
+        for _ in range(MOST_ROUNDS):
+            self._count(nodes, values)
             nodes = [path.numpy() for path in self._recognize_logs(observations)]
-            if is_last:  # drop what the most likely paths leave out
-                kept = torch.from_numpy(np.isin(np.arange(num_nodes), np.concatenate(nodes)))
-                self.hmm.keep_nodes(kept)
-                self._prepare_recognition()
-                nodes, num_nodes = repair.number_anew(nodes)
-                self.counts = repair.Counts.of(nodes, values, num_nodes)
+            if repair.number_anew(nodes)[1] == self.num_nodes:
+                break  # else leave out what the most likely paths leave out
         return [torch.from_numpy(path) for path in nodes]
+
+    def _count(
+        self, nodes: list[NDArray[np.int64]], observations: list[NDArray[np.float64]]
+    ) -> list[NDArray[np.int64]]:
+        """Make the map what labelled logs say; returns the labels, numbered without gaps."""
+        nodes, num_nodes = repair.number_anew(nodes)
+        self.counts = repair.Counts.of(nodes, observations, num_nodes)
+        self._rebuild()
+        return nodes
 
     def _rebuild(self) -> None:
         """Make the map what the counts say."""

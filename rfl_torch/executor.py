@@ -35,6 +35,9 @@ STRANGE = 1.0
 LOST = 3
 """Steps in a row that no node explains after which the robot takes itself for lost."""
 
+FORGOTTEN = 0.01
+"""Chance that between two tasks the robot was put at a place that looks the same."""
+
 LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
 
@@ -208,6 +211,8 @@ class BeliefExecutor:
 
     def _recognize(self, normal: NDArray[np.float64]) -> None:
         """Filter: push the belief over the edges, allow a teleport, weigh by the emission."""
+        if self.node < 0:
+            self.belief = self._first_belief(normal)
         teleport = self._config.teleport
         pushed = self._agent.transition_in @ self.belief
         predicted = (1 - teleport) * pushed + teleport / len(pushed)
@@ -218,7 +223,23 @@ class BeliefExecutor:
         log_belief = np.log(predicted) + log_emission
         belief = np.exp(log_belief - log_belief.max())
         self.belief = belief / belief.sum()
+        self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
+
+    def _first_belief(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Uniform, or what the last task left, if the robot still sees what it saw then.
+
+        Where places look the same, a robot that forgot between two tasks which one it is at could
+        only guess.
+        """
+        uniform = np.full(self._agent.num_nodes, 1.0 / self._agent.num_nodes)
+        if self._agent.last_seen is None:
+            return uniform
+        seen, belief = self._agent.last_seen
+        is_same = np.nanmean(np.abs(seen - normal)) <= self._agent.look_radius / LOOK_STEPS
+        if not is_same or len(belief) != len(uniform):
+            return uniform
+        return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform
 
     def watch(self, observation: NDArray[np.float32]) -> None:
         """Follow where the robot is while someone else chooses its actions."""

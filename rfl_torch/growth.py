@@ -24,18 +24,44 @@ LOG_LEAVE = np.log(1e-3)
 """Log-probability of going off the map, and of coming back on it."""
 
 
-def recognize(hmm: GridHMM, log_emission: Array, log_unknown: float) -> Labels:
+STRANGE, FAMILIAR = 15.0, -50.0
+"""Nats by which "unknown" explains better than the best node what looks like no node, and worse
+what does look like one: to leave the map for one strange step and come back costs 14."""
+
+
+def log_unknown(log_emission: Array, observations: Array, mean: Array, radius: float) -> Array:
+    """Log-density of each step (T,) under the state UNKNOWN.
+
+    Densities cannot tell: a node that was seen a few times is so sharp that all but these look
+    strange. A sight is strange if it is farther than a look's radius from all nodes' means.
+
+    Args:
+        log_emission: of each step under each node, (T, N).
+        observations: normalised, without missing readings, (T, D).
+        mean: of the nodes, (N, D).
+        radius: of a look.
+    """
+    away = np.concatenate(
+        [
+            repair.distance(observations[begin : begin + repair.BATCH], mean).min(1)
+            for begin in range(0, len(observations), repair.BATCH)
+        ]
+    )
+    return log_emission.max(1) + np.where(away > radius, STRANGE, FAMILIAR)
+
+
+def recognize(hmm: GridHMM, log_emission: Array, log_unknown: Array) -> Labels:
     """Most likely nodes (T,) with jumps and the state UNKNOWN.
 
     Args:
         hmm: the map.
         log_emission: of each step under each node, (T, N).
-        log_unknown: log-density that an unknown place gives any observation.
+        log_unknown: of each step under UNKNOWN, (T,).
     """
     num_steps, num_nodes = log_emission.shape
     source, log_prob = _predecessors(hmm)
     back = np.empty((num_steps, num_nodes + 1), np.int64)
-    score = np.append(log_emission[0], log_unknown)
+    score = np.append(log_emission[0], log_unknown[0])
     rows = np.arange(num_nodes)
     for t in range(1, num_steps):
         known = score[:-1]
@@ -50,7 +76,7 @@ def recognize(hmm: GridHMM, log_emission: Array, log_unknown: float) -> Labels:
         back[t, :-1] = np.where(is_jump, jump[1], before)
         leave = known[best] + LOG_LEAVE
         back[t, -1] = best if leave > score[-1] else num_nodes
-        score = np.append(value + log_emission[t], max(leave, score[-1]) + log_unknown)
+        score = np.append(value + log_emission[t], max(leave, score[-1]) + log_unknown[t])
         score -= score.max()
     path = np.empty(num_steps, np.int64)
     path[-1] = score.argmax()

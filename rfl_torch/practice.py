@@ -6,7 +6,7 @@ there. All that it saw and did goes into the map, the controllers and the costs 
 
     random          any node
     least_visited   the node that was seen least
-    frontier        the nearest node with actions that were never tried and lead to no known node
+    frontier        the node with most actions never tried, that lead to no known node, for the way
     progress        the node whose success rate, or lack of one, changes most
 """
 
@@ -97,7 +97,8 @@ class Goals:
         if not is_open.any():
             return _smallest(agent.visits, rng)
         away = cost_to_go(agent.graph.T.tocsr(), np.array([node]))
-        away = np.where(is_open, away * 2.0**self.failures, np.inf)
+        promise = np.maximum(1, self.untried.sum(1)) / 2.0**self.failures
+        away = np.where(is_open, (away + LOOK_AROUND) / promise, np.inf)
         return _smallest(away, rng) if np.isfinite(away).any() else _smallest(agent.visits, rng)
 
     def note(self, goal: int, reached: bool) -> None:
@@ -116,14 +117,14 @@ class Goals:
 
 
 def untried(agent: "Agent") -> NDArray[np.bool_]:
-    """Actions that were hardly tried at a node and lead to no neighbour that is known, (N, K)."""
+    """Actions that were never tried at a node and lead to no neighbour that is known, (N, K)."""
     graph = agent.graph.tocoo()
     mean = agent.hmm.emission_mean.detach().float()
     inputs = torch.cat([mean[graph.row], mean[graph.col]], 1)
     with torch.no_grad():
         unit = agent.bank(inputs, torch.from_numpy(graph.col).long()).numpy()
     way, _ = nearest_direction(unit)
-    known = agent.tried >= HOLD / 2
+    known = agent.tried > 0
     known[graph.row, way] = True
     return ~known
 

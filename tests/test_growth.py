@@ -21,20 +21,20 @@ def test_recognition_finds_the_best_of_all_paths_with_jumps_and_unknown_steps():
     rng = np.random.default_rng(0)
     jump, leave = growth.LOG_JUMP, growth.LOG_LEAVE
     for _ in range(20):
-        rows = 12 * rng.standard_normal((5, 3))
+        rows, unknown = 12 * rng.standard_normal((5, 3)), 8 * rng.standard_normal(5)
         best, best_path = -np.inf, None
         for path in itertools.product(range(4), repeat=5):
-            total = rows[0, path[0]] if path[0] < 3 else -4.0
+            total = rows[0, path[0]] if path[0] < 3 else unknown[0]
             for t in range(1, 5):
                 i, j = path[t - 1], path[t]
                 if i < 3 and j < 3:
                     total += max(log_a[i, j], jump)
                 elif i != j:
                     total += leave
-                total += rows[t, j] if j < 3 else -4.0
+                total += rows[t, j] if j < 3 else unknown[t]
             if total > best:
                 best, best_path = total, path
-        found = growth.recognize(hmm, rows, -4.0)
+        found = growth.recognize(hmm, rows, unknown)
         assert found.tolist() == [growth.UNKNOWN if node == 3 else node for node in best_path]
 
 
@@ -133,3 +133,13 @@ def test_a_log_of_another_robot_is_refused(half_agent):
     log = dot_log(50)
     with pytest.raises(ValueError, match=r"\(readings, actions\) \(3, 2\), needs \(4, 2\)"):
         Agent.load(half_agent).partial_fit(Trajectory(log.observations[:, :3], log.actions))
+
+
+def test_every_node_of_a_repaired_map_is_on_its_logs_path_and_outlives_saving(tmp_path):
+    log = dot_log(2500, seed=3)
+    agent = Agent(dot_config(shape=(8, 8))).fit(log)
+    assert (agent.visits[:-1] > 0).sum() >= agent.num_nodes - 2  # the last step leaves none
+    assert agent.counts.num_nodes == agent.num_nodes
+    agent.save(tmp_path / "agent.safetensors")
+    again = Agent.load(tmp_path / "agent.safetensors")
+    assert (again.recognize(log.observations) == agent.recognize(log.observations)).all()

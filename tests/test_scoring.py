@@ -9,9 +9,11 @@ import pytest
 import torch
 from scipy.sparse import csr_array
 from scipy.stats import binomtest
+from worlds import dot_config, dot_log
 
 from experiments import scoring
 from experiments.scoring import MAZE, PENDULUM, NodeTable, Outcome, Task, Trial
+from rfl_torch import Agent, Trajectory
 from sims.layouts import load_layout
 
 
@@ -338,3 +340,19 @@ def test_detour_is_known_between_free_places_only():
     assert detour == pytest.approx(2000 * math.sqrt(2) / shortest)
     for target in (np.zeros(2), np.full(2, np.nan), a + 1.0, None):
         assert math.isnan(scoring.detour(Trial(0, target, outcome, True), layout))
+
+
+def test_forecasts_of_a_models_own_samples_are_as_sure_as_right():
+    agent = Agent(dot_config(repairs=False)).fit(dot_log(1500, seed=4))
+    generator = torch.Generator().manual_seed(0)
+    drawn = agent.hmm.sample(3000, generator).observations.numpy()
+    raw = drawn * agent.observation_scale + agent.observation_low
+    log = Trajectory(raw.astype(np.float32), np.zeros((2999, 2), np.float32))
+    agent.chain = agent.hmm.chain()
+    ranks = scoring.forecast_ranks(agent, log, (1, 10), 1000, np.random.default_rng(1))
+    nominal = np.linspace(0.1, 0.9, 9)
+    for steps in (1, 10):
+        np.testing.assert_allclose(scoring.held_shares(ranks[steps], nominal), nominal, atol=0.03)
+    agent.hmm.emission_log_scale.data += 0.7  # twice as unsure as right
+    wide = scoring.forecast_ranks(agent, log, (1,), 1000, np.random.default_rng(1))[1]
+    assert (scoring.held_shares(wide, nominal) > nominal + 0.03).mean() > 0.7

@@ -1,0 +1,409 @@
+"""How much of a room an agent reaches: this method, the paper's, and peers, at equal steps.
+
+Part of `python -m experiments.benchmark reach`. A contestant gets environment steps without reward,
+and is then asked to go to places drawn from the whole room; those with a map also to its nodes.
+All are scored by ground truth, from independent starts, on the same places.
+
+The peer is Stable-Baselines3's SAC with hindsight experience replay: the same 24 ranges, the goal's
+ranges, and the ranges reached instead as hindsight goals. It counts as there if it comes near the
+goal at any time, since it has no word for "reached". Its episodes begin anywhere in the room, which
+no robot with a log can have.
+"""
+
+import importlib.util
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from tqdm import tqdm
+
+import sims
+from experiments import cli, figures, scoring
+from experiments.scoring import MAZE, PLACE_TOLERANCE, Share, Task, wilson
+from rfl_torch import Agent, AgentConfig, Trajectory, record
+from rfl_torch.practice import Strategy
+
+PEER_HORIZON = 100
+"""Steps of the peer's episodes."""
+
+PEER_NEAR = 0.03
+"""Mean absolute difference of ranges within which the peer's goal counts as reached in training:
+about a full step."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Going to places: the paper's configuration, the default, practice, and peers."""
+
+    layouts: tuple[str, ...] = tuple(sims.layouts.built_in_layouts())
+    """Built-in names or JSON files."""
+    seeds: int = 5
+    """Logs of each layout."""
+    trials: int = 118
+    """Tasks of each kind."""
+    num_steps: int = 10_000
+    """Steps of a log; the one held 3 is twice as long."""
+    practice: int = 20_000
+    """Steps of practice."""
+    strategies: bool = True
+    """Practise by each goal strategy, not by the default one alone."""
+    peer_steps: tuple[int, ...] = (10_000, 30_000, 100_000)
+    """Environment steps of the peer; it needs the extra `reach`."""
+    peer_seeds: int = 1
+    """Seeds that the peer gets; 100,000 steps take it half an hour."""
+    out: Path = Path("runs/reach")
+    """Folder for results.json and the plot."""
+    seed: int = 0
+    """First seed."""
+
+
+class Row(NamedTuple):
+    """One contestant on one log."""
+
+    name: str
+    layout: str
+    seed: int
+    num_steps: int
+    """Environment steps that it learned from."""
+    seconds: float
+    """Seconds of learning, steps included."""
+    nodes: Share | None
+    """True success on node goals."""
+    places: Share
+    """True success on place goals."""
+    coverage: float
+    """Share of the free cells within a node's reach; NaN without a map."""
+    wormholes: float
+
+
+def benchmark_reach(config: Reach) -> None:
+    """Run all contestants, print the table, write results.json and the plot."""
+    for name in ("seeds", "trials", "num_steps", "practice"):
+        cli.check_count(name, getattr(config, name))
+    has_peer = importlib.util.find_spec("stable_baselines3") is not None
+    if config.peer_steps and not has_peer:
+        print("SAC with HER left out: pip install 'rfl-torch[reach]'")
+    rows: list[Row] = []
+    runs = [(layout, config.seed + k) for layout in config.layouts for k in range(config.seeds)]
+    for layout, seed in (bar := tqdm(runs, unit="log")):
+        for row in _contest(config, layout, seed, has_peer):
+            rows.append(row)
+            bar.set_postfix(layout=layout, seed=seed, done=row.name, refresh=True)
+            _keep(config, rows)
+    print(cli.table(*_table(rows)))
+    print(f"{config.out / 'results.json'}, {config.out / 'reach.png'}")
+
+
+def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[Row]:
+    """All contestants on one layout and seed."""
+    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
+        judge = Judge(env, layout, seed, config.trials)
+        yield judge.random_walk()
+        for name, times, hold, choices in (
+            ("paper", 1, 1, AgentConfig.paper()),
+            ("default, independent actions", 1, 1, AgentConfig()),
+            ("default, held 3", 2, 3, AgentConfig()),
+            ("default, held 10", 1, 10, AgentConfig()),
+        ):
+            log = record(env, times * config.num_steps, hold, seed)
+            begin = time.perf_counter()
+            agent = Agent(choices, seed).fit(log)
+            yield judge.score(name, agent, [log], time.perf_counter() - begin)
+        oracle = know_places(agent, log, seed)
+        yield judge.score("oracle map, held 10", oracle, [log], 0.0)
+        for strategy in get_args(Strategy) if config.strategies else ("frontier",):
+            yield from _practise(config, judge, env, agent, log, strategy, seed)
+        if has_peer and seed < config.seed + config.peer_seeds:
+            yield from _run_peer(config, judge, layout, seed)
+
+
+def _practise(
+    config: Reach,
+    judge: "Judge",
+    env: gym.Env,
+    start: Agent,
+    log: Trajectory,
+    strategy: Strategy,
+    seed: int,
+) -> Iterator[Row]:
+    """Practise by one strategy, and be scored four times on the way."""
+    agent, logs, seconds = _copy(start, config.out), [log], 0.0
+    watched = Watched(env)
+    for part in range(4):
+        begin = time.perf_counter()
+        agent.practice(watched, config.practice // 4, seed=4 * seed + part, strategy=strategy)
+        seconds += time.perf_counter() - begin
+        logs.append(watched.take(log))
+        yield judge.score(f"practice: {strategy}", agent, logs, seconds)
+
+
+def _copy(agent: Agent, folder: Path) -> Agent:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / ".copy.safetensors"
+    agent.save(path)
+    copy = Agent.load(path)
+    path.unlink()
+    return copy
+
+
+class Watched(gym.Wrapper):
+    """Keeps the ground truth of what was seen, for the judge."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self._seen: list[tuple[Any, Any]] = []
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin anew."""
+        observation, info = self.env.reset(**options)
+        self._seen = [(observation, info["ground_truth"])]
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Go on, and keep what is seen."""
+        result = self.env.step(action)
+        self._seen.append((result[0], result[4]["ground_truth"]))
+        return result
+
+    def take(self, like: Trajectory) -> Trajectory:
+        """What was seen since the last reset; its actions are not kept, and are zeros."""
+        observations, truth = (np.stack(part) for part in zip(*self._seen, strict=True))
+        actions = np.zeros((len(observations) - 1, like.actions.shape[1]), np.float32)
+        return Trajectory(observations, actions, *like.bounds, truth)
+
+
+def know_places(agent: Agent, log: Trajectory, seed: int) -> Agent:
+    """An agent whose nodes are clusters of the log's true positions."""
+    assert log.ground_truth is not None
+    _, node = kmeans2(log.ground_truth, agent.num_nodes, minit="++", rng=seed)
+    observations = agent.normalize(log.observations)
+    oracle = Agent(agent.config, agent.seed)
+    oracle.__dict__ |= {name: value for name, value in agent.__dict__.items() if name != "hmm"}
+    oracle.hmm = type(agent.hmm)((2, 2), observations.shape[1])
+    oracle.learn_from_labels([log], [node.astype(np.int64)])
+    return oracle
+
+
+# -- judging ------------------------------------------------------------------------------------
+
+
+class Judge:
+    """Scores contestants on one log's room, all on the same tasks."""
+
+    def __init__(self, env: gym.Env, layout: str, seed: int, trials: int) -> None:
+        self._env, self._layout, self._seed, self._trials = env, layout, seed, trials
+        rng = np.random.default_rng([seed, 1])
+        places = scoring.place_tasks(env, trials, rng)
+        self.places = scoring.from_anywhere(places, env, None, rng)
+
+    def score(self, name: str, agent: Agent, logs: list[Trajectory], seconds: float) -> Row:
+        """Let an agent do the tasks."""
+        table = scoring.node_table(agent, logs, MAZE)
+        rng = np.random.default_rng([self._seed, 2])
+        nodes = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
+        truth = scoring.ground_truth(logs)
+        covered = scoring.coverage(scoring.maze_layout(self._env), truth, table)
+        return Row(
+            name,
+            self._layout,
+            self._seed,
+            sum(log.num_steps for log in logs),
+            seconds,
+            self._run(agent, nodes, logs[-1].ground_truth),
+            self._run(agent, self.places, None),
+            covered["coverage_nodes"],
+            scoring.wormhole_share(table),
+        )
+
+    def _run(self, agent: Agent, tasks: list[Task], truth: Any) -> Share:
+        start = None if truth is None else truth[-1]
+        trials = scoring.run_tasks(self._env, agent, tasks, MAZE, start, self._seed)
+        return _share([bool(trial.is_true) for trial in trials])
+
+    def peer(self, name: str, num_steps: int, seconds: float, act: Callable[..., Any]) -> Row:
+        """Let `act(observation, goal) -> action` do the places; near at any time counts."""
+        places = _share([self._comes_near(task, act) for task in self.places])
+        return Row(name, self._layout, self._seed, num_steps, seconds, None, places, np.nan, np.nan)
+
+    def random_walk(self) -> Row:
+        """Held random actions."""
+        innate = np.random.default_rng(self._seed)
+        held: dict[str, Any] = {"left": 0}
+
+        def act(observation: Any, goal: Any) -> Any:
+            if held["left"] == 0:
+                held.update(left=10, action=innate.uniform(-1, 1, 2).astype(np.float32))
+            held["left"] -= 1
+            return held["action"]
+
+        return self.peer("random walk (near at any time)", 0, 0.0, act)
+
+    def _comes_near(self, task: Task, act: Callable[..., Any]) -> bool:
+        assert task.start is not None
+        options = {MAZE.reset_option: tuple(task.start)}
+        observation, info = self._env.reset(options=options)
+        for _ in range(MAZE.limit):
+            if np.linalg.norm(info["ground_truth"] - task.target) <= PLACE_TOLERANCE:
+                return True
+            observation, _, _, _, info = self._env.step(act(observation, task.goal))
+        return False
+
+
+def _share(outcomes: list[bool]) -> Share:
+    return wilson(sum(outcomes), len(outcomes))
+
+
+# -- the peer -----------------------------------------------------------------------------------
+
+
+class GoalMaze(gym.Wrapper):
+    """The maze with a goal's ranges beside the robot's own, as HER wants it."""
+
+    def __init__(self, env: gym.Env, seed: int) -> None:
+        super().__init__(env)
+        space = env.observation_space
+        self.observation_space = gym.spaces.Dict(
+            {name: space for name in ("observation", "achieved_goal", "desired_goal")}
+        )
+        self._rng = np.random.default_rng(seed)
+        self._seen: list[NDArray[np.float32]] = []
+        self._left = 0
+
+    def reset(self, **options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin at a random place, with a sight that was seen before as the goal."""
+        place = scoring.maze_layout(self.env).random_free_position(self._rng)
+        observation, info = self.env.reset(options={MAZE.reset_option: place})
+        self._seen.append(observation)
+        self._goal = self._seen[self._rng.integers(len(self._seen))]
+        self._left = PEER_HORIZON
+        return self._dict(observation), info
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Go on; the reward is -1 until the goal is in sight."""
+        observation, _, _, _, info = self.env.step(action)
+        self._seen.append(observation)
+        self._left -= 1
+        reward = float(self.compute_reward(observation, self._goal, info))
+        return self._dict(observation), reward, reward == 0.0, self._left == 0, info
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        """0 where the ranges differ by less than a full step, else -1."""
+        return -(np.abs(achieved - desired).mean(-1) > PEER_NEAR).astype(np.float32)
+
+    def _dict(self, observation: Any) -> dict[str, Any]:
+        return {
+            "observation": observation,
+            "achieved_goal": observation,
+            "desired_goal": self._goal,
+        }
+
+
+def _run_peer(config: Reach, judge: Judge, layout: str, seed: int) -> Iterator[Row]:
+    """Train SAC with HER, and score it at each number of steps."""
+    from stable_baselines3 import SAC, HerReplayBuffer
+
+    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
+        model = SAC(
+            "MultiInputPolicy",
+            GoalMaze(env, seed),
+            replay_buffer_class=HerReplayBuffer,
+            replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+            learning_starts=1000,
+            learning_rate=1e-3,
+            gamma=0.98,
+            seed=seed,
+            device="cpu",
+        )
+
+        def act(observation: Any, goal: Any) -> Any:
+            seen = {"observation": observation, "achieved_goal": observation, "desired_goal": goal}
+            return model.predict(seen, deterministic=True)[0]
+
+        begin, done = time.perf_counter(), 0
+        for steps in sorted(config.peer_steps):
+            model.learn(steps - done, reset_num_timesteps=done == 0)
+            done = steps
+            yield judge.peer(
+                "SAC + HER (near at any time)", steps, time.perf_counter() - begin, act
+            )
+
+
+# -- results ------------------------------------------------------------------------------------
+
+
+def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
+    """Rows pooled over seeds, one for each layout, contestant and number of steps."""
+    header = ["layout", "contestant", "steps", "logs", "node goals", "place goals", "coverage"]
+    header += ["wormholes", "seconds"]
+    groups: dict[tuple[str, str, int], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.layout, row.name, row.num_steps), []).append(row)
+    lines = []
+    for (layout, name, steps), group in groups.items():
+        nodes = [row.nodes for row in group if row.nodes is not None]
+        lines.append(
+            [
+                layout,
+                name,
+                str(steps),
+                str(len(group)),
+                str(_pool(nodes)) if nodes else "-",
+                str(_pool([row.places for row in group])),
+                _percent([row.coverage for row in group]),
+                _percent([row.wormholes for row in group]),
+                f"{np.median([row.seconds for row in group]):.0f}",
+            ]
+        )
+    return header, lines
+
+
+def _pool(shares: list[Share]) -> Share:
+    return wilson(sum(x.successes for x in shares), sum(x.trials for x in shares))
+
+
+def _percent(values: list[float]) -> str:
+    return "-" if np.isnan(values).all() else f"{100 * np.nanmean(values):.1f} %"
+
+
+def _keep(config: Reach, rows: list[Row]) -> None:
+    """Write what there is so far."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    plain = [
+        row._asdict()
+        | {"nodes": None if row.nodes is None else row.nodes._asdict()}
+        | {"places": row.places._asdict()}
+        | {name: _or_none(getattr(row, name)) for name in ("coverage", "wormholes")}
+        for row in rows
+    ]
+    with cli.replacing(config.out / "results.json") as new:
+        new.write_text(json.dumps(plain, indent=1) + "\n")
+    curves: dict[str, dict[int, list[float]]] = {}
+    for row in rows:
+        if row.num_steps:
+            points = curves.setdefault(row.name, {})
+            points.setdefault(row.num_steps, []).append(row.places.successes / row.places.trials)
+    with cli.replacing(config.out / "reach.png") as new:
+        figures.draw_success_curve(
+            new,
+            {name: _curve(points) for name, points in curves.items()},
+            "environment steps without reward",
+            "place goals truly reached",
+        )
+
+
+def _curve(points: dict[int, list[float]]) -> tuple[Any, Any, Any, Any]:
+    x = sorted(points)
+    ends = [(np.mean(points[k]), np.min(points[k]), np.max(points[k])) for k in x]
+    mean, low, high = (np.array(part) for part in zip(*ends, strict=True))
+    return np.array(x), mean, low, high
+
+
+def _or_none(value: float) -> float | None:
+    return None if np.isnan(value) else value
