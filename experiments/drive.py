@@ -100,13 +100,13 @@ class Drive:
             self._seed += 1
             self.agent.practice(watched, num_steps, seed=self._seed, progress=self._count)
         finally:
-            self.practice_share = None
             log = watched.log()
             if log is not None:
                 self.logs.append(log)
             self.place_nodes()
             self._is_over = False
             self._wait()
+            self.practice_share = None  # last: now the loop goes on
         self._tell(f"practised: {before} nodes before, {self.agent.num_nodes} now")
 
     # -- what it does -----------------------------------------------------------------------------
@@ -196,6 +196,11 @@ class Drive:
             reason = f": {self.executor.reason}" if self._status == "gave_up" else ""
             self._tell(f"{self.status} node {self.goal}{reason}")
 
+    def fail(self, error: Exception) -> None:
+        """Tell of an error, and stop until told to go on."""
+        self.is_paused = True
+        self._tell(f"stopped: {error}")
+
     def _tell(self, text: str) -> None:
         self.events.append(Event(self.num_steps, text))
         self.num_events += 1
@@ -226,8 +231,11 @@ class Watched(gym.Wrapper):
         self._actions.append(action)
         self._truths.append(info.get("ground_truth"))
         self._drive.num_steps += 1
-        self._drive._sense(observation, info)
-        self._drive.executor.act(observation)  # it goes nowhere, and recognises what is seen
+        drive = self._drive
+        drive._sense(observation, info)
+        if len(drive.executor.belief) != drive.agent.num_nodes:
+            drive._wait()  # the map has grown
+        drive.executor.act(observation)  # it goes nowhere, and recognises what is seen
         return observation, float(reward), terminated, truncated, info
 
     def log(self) -> Trajectory | None:

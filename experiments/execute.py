@@ -60,6 +60,8 @@ class Config:
     hold: int = 1
     """Steps that the random walk holds each action for, in environments that are not ours; give
     the log's."""
+    levels: int | None = None
+    """Values that the random walk draws each action from; give the log's."""
     seed: int = 0
     """Seed of the goals, the starts and the executors."""
 
@@ -114,7 +116,7 @@ def main(config: Config) -> None:
             if world is None:
                 goals = tqdm([trial.goal for trial in trials], desc="random walk", unit="task")
                 walk = scoring.observed_walk_share(
-                    env, agent, goals, limit, config.hold, config.seed
+                    env, agent, goals, limit, config.hold, config.seed, config.levels
                 )
                 walks_json[name] = walk._asdict()
                 rows.append(["random walk", "-", str(walk), "-", "-", "-"])

@@ -12,6 +12,7 @@ import asyncio
 import base64
 import io
 import socket
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from experiments import cli, execute, scoring
+from experiments import cli, execute, scoring, train
 from experiments.drive import Drive
 from experiments.figures import BLUE, GREEN, INK, ORANGE, PALE, RED
 from rfl_torch import Agent
@@ -68,6 +69,8 @@ class Config:
     """Port of the page."""
     practice_steps: int = 2000
     """Control steps of a practice."""
+    out: Path | None = None
+    """File to write the agent to after each practice; left out, what it learned is lost."""
     layout: str | None = None
     """The maze's layout: a built-in name, or the path of a JSON file."""
     env_kwargs: str = "{}"
@@ -90,6 +93,8 @@ def main(config: Config) -> None:
         raise ValueError(f"--rate is {config.rate}; needs more than 0 steps a second.")
     cli.check_count("--practice-steps", config.practice_steps)
     _check_port(config.port)
+    if config.out is not None:
+        cli.check_writable(config.out)
     agent = Agent.load(config.model)
     logs = cli.read_all_logs(config.log, config.observation_keys)
     with _make_env(config) as env:
@@ -98,7 +103,11 @@ def main(config: Config) -> None:
 
         async def keep_ticking() -> None:
             while True:
-                drive.tick()
+                try:
+                    drive.tick()
+                except Exception as error:  # told on the page, which goes on
+                    traceback.print_exc()
+                    drive.fail(error)
                 await asyncio.sleep(1 / config.rate)
 
         app.on_startup(keep_ticking)
@@ -173,8 +182,11 @@ def build_page(drive: Drive, config: Config) -> None:
             async def start_practice() -> None:
                 try:
                     await run.io_bound(drive.practise, config.practice_steps)
+                    if config.out is not None:
+                        train.save_agent(drive.agent, config.out)
                 except Exception as error:  # told on the page, which goes on
-                    ui.notify(f"practice failed: {error}", type="negative")
+                    traceback.print_exc()
+                    drive.fail(error)
 
             practise.on_click(start_practice)
             picture = ui.interactive_image().classes("w-full rounded").props('id="picture"')

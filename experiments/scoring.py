@@ -527,7 +527,13 @@ def random_walk_share(
 
 
 def observed_walk_share(
-    env: gym.Env, agent: Agent, goals: Sequence[int], limit: int, hold: int, seed: int
+    env: gym.Env,
+    agent: Agent,
+    goals: Sequence[int],
+    limit: int,
+    hold: int,
+    seed: int,
+    levels: int | None = None,
 ) -> "Share":
     """Return the share of goals that random actions come to, by `observed_distance`, at any time.
 
@@ -540,9 +546,10 @@ def observed_walk_share(
         limit: steps of a task at most.
         hold: steps that each random action is held for.
         seed: of the environment and of the actions.
+        levels: see `InnateController`.
     """
     found = 0
-    innate = InnateController(*agent.action_bounds, hold, seed=seed)
+    innate = InnateController(*agent.action_bounds, hold, levels, seed)
     observation, _ = env.reset(seed=seed)
     is_over = False
     for goal in goals:

@@ -139,7 +139,7 @@ def test_practice_moves_the_robot_and_lays_the_map_out_anew(drive):
 
 def test_practice_of_the_agent_itself_extends_the_map(drive):
     before = drive.agent.num_nodes
-    drive.practise(600)
+    drive.practise(600)  # the map grows on the way
     assert drive.agent.num_nodes >= before
     assert len(drive.place) == drive.agent.num_nodes
     assert np.isfinite(drive.place).all(1).mean() > 0.9
@@ -157,6 +157,12 @@ def test_a_practice_that_fails_gives_the_robot_back(drive):
         drive.practise(5)
     assert drive.status == "waiting"
     drive.tick()
+
+
+def test_an_error_is_told_and_stops_the_robot_not_the_page(drive):
+    drive.fail(RuntimeError("no answer from the motor"))
+    assert drive.status == "paused"
+    assert texts(drive)[-1] == "stopped: no answer from the motor"
 
 
 def test_the_chart_shows_the_true_place_only_where_it_is_known(drive):
