@@ -3,6 +3,7 @@
 python -m experiments.trust resume      kill training and practice at random moments
 python -m experiments.trust files       damage and forge checkpoints
 python -m experiments.trust threads     learn with one thread and with several
+python -m experiments.trust faults      break sensors and walls of the maze
 
 Each prints a table; docs/trust.md has them all. What is counted as a failure ends the command with
 status 1.
@@ -25,7 +26,8 @@ import tyro
 from safetensors.torch import load_file
 from tqdm import tqdm
 
-from experiments import cli, practice, record, train
+import rfl_torch
+from experiments import cli, faults, practice, record, train
 from rfl_torch import Agent, AgentConfig, Trajectory
 from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
 
@@ -64,10 +66,25 @@ class Threads:
     """Seed of the log."""
 
 
+@dataclass(frozen=True)
+class Faults:
+    """Faults of sensors and worlds: success in the maze beside the healthy figure."""
+
+    num_steps: int = 10_000
+    """Steps of the log, held 3 steps each."""
+    tasks: int = 60
+    """Tasks for each fault and log: nodes, one after the other."""
+    seeds: int = 2
+    """Logs, each learned from."""
+    seed: int = 0
+    """Seed of the first log, its goals and its faults."""
+
+
 Config = (
     Annotated[Resume, tyro.conf.subcommand("resume")]
     | Annotated[Files, tyro.conf.subcommand("files")]
     | Annotated[Threads, tyro.conf.subcommand("threads")]
+    | Annotated[Faults, tyro.conf.subcommand("faults")]
 )
 
 
@@ -77,6 +94,7 @@ def main(config: Any) -> None:
         Resume: try_resume,
         Files: try_files,
         Threads: try_threads,
+        Faults: try_faults,
     }
     if not trials[type(config)](config):
         sys.exit(1)
@@ -155,7 +173,7 @@ def equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bo
 def _in_process(run: Callable[[Any], None], options: Any, seconds: float | None) -> bool:
     """Call `run` in a process that is killed after so many seconds; whether it came to its end."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["experiments.trust"])
+    context.set_forkserver_preload(["experiments.train", "experiments.practice"])
     process = context.Process(target=run, args=(options,))
     process.start()
     process.join(seconds)
@@ -207,7 +225,7 @@ def try_files(config: Files) -> bool:
                 outcome = judge(path, make(path, rng))
                 counts[outcome if outcome in counts else "wrong"] += 1
                 if outcome not in counts:
-                    print(f"{kind}: {outcome}", file=sys.stderr)
+                    tqdm.write(f"{kind}: {outcome}", file=sys.stderr)
             rows.append([kind, str(config.cases), *map(str, counts.values())])
             failures += counts["wrong"]
     print(cli.table(["files", "number", "refused", "read right", "wrong"], rows))
@@ -378,6 +396,48 @@ class _TrainWith:
         with contextlib.suppress(ValueError):  # more than the machine has
             numba.set_num_threads(self.count)
         _train(options)
+
+
+# -- faults -------------------------------------------------------------------------------------
+
+DEAD_SHARE, OUTLIER_SHARE = 0.85, 0.95
+"""Of the healthy figure, with 2 of 24 sensors dead and with 2 % of outliers."""
+
+
+def try_faults(config: Faults) -> bool:
+    """Drive with every fault; whether dead sensors and outliers leave as much as they must."""
+    cli.check_count("--tasks", config.tasks)
+    cli.check_count("--seeds", config.seeds)
+    pooled: dict[str, list[faults.Tally]] = {name: [] for name in faults.FAULTS}
+    with tempfile.TemporaryDirectory() as name:
+        for seed in range(config.seed, config.seed + config.seeds):
+            env = cli.make_env("rfl/RangefinderMaze-v0", "paper", max_episode_steps=-1)
+            log = rfl_torch.record(env, config.num_steps, hold=3, seed=seed)
+            env.close()
+            path = Path(name) / f"{seed}.safetensors"
+            train.fit(AgentConfig(), [log], seed).save(path)
+            for kind in tqdm(faults.FAULTS, desc=f"seed {seed}", unit="fault"):
+                agent = Agent.load(path)  # what one fault taught it, the next must not know
+                tally = faults.go(agent, log, faults.FAULTS[kind], config.tasks, seed)
+                pooled[kind].append(tally)
+    header = ["fault", "true", "believed, not true", "gave up", "ran out", "steps", "of healthy"]
+    rows, shares = [], {}
+    for kind, tallies in pooled.items():
+        done = sum(tally.true for tally in tallies)
+        tasks = sum(tally.reachable for tally in tallies)
+        shares[kind] = done / tasks
+        false, gave_up = (sum(getattr(t, x) for t in tallies) for x in ("false", "gave_up"))
+        ran_out = sum(tally.tasks for tally in tallies) - done - false - gave_up
+        steps = f"{np.nanmedian([tally.steps for tally in tallies]):.0f}"
+        relative = f"{100 * shares[kind] / shares['healthy']:.0f} %"
+        rows.append(
+            [kind, f"{done}/{tasks}", *map(str, (false, gave_up, ran_out)), steps, relative]
+        )
+    print(cli.table(header, rows))
+    dead = min(share for kind, share in shares.items() if kind.startswith("2 sensors"))
+    outliers = shares["2 % of readings outliers"]
+    healthy = shares["healthy"]
+    return dead >= DEAD_SHARE * healthy and outliers >= OUTLIER_SHARE * healthy
 
 
 if __name__ == "__main__":

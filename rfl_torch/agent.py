@@ -672,7 +672,14 @@ class Agent:
         try:
             agent = cls(AgentConfig.from_json(config["agent"]), int(config["seed"]))
             agent._restore(state)
-        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            RuntimeError,
+            IndexError,
+            ArithmeticError,
+        ) as error:
             raise ValueError(f"{path} is no agent that this version can use: {error}") from None
         return agent
 
@@ -737,6 +744,8 @@ class Agent:
         for name in ("edges.count", "tried", "observation_scale", "counts.weight", "look_radius"):
             if name in state and (state[name] < 0).any():
                 raise ValueError(f"{name} has a number below zero")
+        if state["look_radius"] == 0:
+            raise ValueError("look_radius is 0")
         factor = state["blame.factor"]
         if ((factor < 0.99) | (factor > 1.01 * BLAME_LIMIT)).any():
             raise ValueError(f"blame.factor has numbers outside 1 to {BLAME_LIMIT:g}")

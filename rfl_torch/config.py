@@ -121,6 +121,8 @@ class AgentConfig:
         except (TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"the configuration doesn't fit this version: {error}") from None
         _check_fields(config)
+        if config.counted_readings == 0:
+            raise ValueError("counted_readings is 0, needs a positive number or None")
         if executor.teleport > 1 or executor.blame < 1:
             raise ValueError(
                 f"teleport is {executor.teleport} and blame {executor.blame}; need a probability "
