@@ -484,6 +484,21 @@ def observed_distance(agent: Agent, observation: NDArray[np.float32], node: int)
     return float(np.sqrt(np.nanmean((agent.normalize(observation) - mean) ** 2)))
 
 
+def longest_stay(env: gym.Env, executor: Any, outcome: Outcome, task: Task, world: World) -> int:
+    """Let the executor act on after a task, for as long as a task takes at most.
+
+    Returns the most steps in a row that the robot is near the task's target.
+    """
+    assert task.target is not None
+    observation, longest, stay = outcome.observation, 0, 0
+    for _ in range(world.limit):
+        observation, *_, info = env.step(executor.act(observation))
+        is_near = world.distance(info["ground_truth"], task.target) <= task.tolerance
+        stay = stay + 1 if is_near else 0
+        longest = max(longest, stay)
+    return longest
+
+
 def _is_true(task: Task, outcome: Outcome, world: World) -> bool | None:
     if task.target is None or outcome.trace is None:
         return None

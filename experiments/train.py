@@ -27,10 +27,7 @@ from rfl_torch.monitor import TensorBoardMonitor
 CONFIGS: dict[str, Callable[[], AgentConfig]] = {
     "default": AgentConfig,
     "paper": AgentConfig.paper,
-    # On a torus a velocity sheet has no border to fold at: R2 of the velocity 0.944 -> 0.953.
-    "pendulum": lambda: replace(
-        AgentConfig(), shape=(22, 22), metric="chebyshev", boundary="torus"
-    ),
+    "pendulum": AgentConfig.smooth,
     "paper-pendulum": AgentConfig.paper_pendulum,
 }
 

@@ -25,6 +25,7 @@ from rfl_torch.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from rfl_torch.circle import find_periods, unwrap_to_circles
 from rfl_torch.config import AgentConfig
 from rfl_torch.controllers import (
     MLPBank,
@@ -40,6 +41,7 @@ from rfl_torch.controllers import (
 from rfl_torch.executor import BLAME_LIMIT, Executor, make_executor
 from rfl_torch.hmm import MAX_READING, GridHMM, Statistics
 from rfl_torch.innate import directions
+from rfl_torch.motion import Memory, Motion, remember, remember_more
 from rfl_torch.online_svr import SVRBank
 from rfl_torch.planner import look_alikes, seen_edges
 from rfl_torch.practice import Attempt, PracticeMonitor, Strategy, practice
@@ -106,6 +108,8 @@ class Agent:
     """Normalised observation (D,) and belief (N,) of the last control step."""
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
+    memory: Memory | None = None
+    """What motion is learned from, where the world isn't reversible and `config.steers`."""
     least_familiar: float
     """Tempered log-density [nat] under its node that an observation of a known place has."""
 
@@ -115,6 +119,7 @@ class Agent:
         self.record: list[learning.Progress] = []
         self.counts = self.statistics = None
         self.last_seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._motion: Motion | None = None
 
     # -- learning ---------------------------------------------------------------------------
 
@@ -207,6 +212,8 @@ class Agent:
                 self.config.horizon,
             )
             parts.append(assign_triplets(*samples))
+            if self.memory is not None:
+                self.memory, self._motion = remember_more(self.memory, *samples[:3]), None
             if self.is_reversible:
                 parts.append(assign_reversed(*samples))
         self.samples = latest(concatenate(parts), MOST_SAMPLES)
@@ -332,6 +339,11 @@ class Agent:
             )
             low, high = np.where(is_constant, [[0.0], [0.0]], [low, high])
         self.observation_low, self.observation_scale = _unit_range(low, high)
+        self.observation_period = np.zeros(len(low))
+        if self.config.unwraps:
+            used = ~is_constant
+            raw = [log.observations[:, used].astype(np.float64) for log in logs]
+            self.observation_period[used] = find_periods(raw) / self.observation_scale[used]
         bounds = [log.bounds for log in logs]
         self.action_bounds = (
             np.min([low for low, _ in bounds], 0),
@@ -401,13 +413,14 @@ class Agent:
         self.edges = repair.sum_edges(nodes, self.num_nodes)
         unit_actions = [self._unit_actions(log.actions) for log in logs]
         self.tried = repair.count_directions(nodes, unit_actions, self.num_nodes)
-        forward, backward, densities = [], [], []
+        forward, backward, densities, recognized = [], [], [], []
         for log, sequence, path in zip(logs, observations, paths, strict=True):
             densities.append(self._own_log_density(sequence, path))
             actions = torch.from_numpy(self._unit_actions(log.actions))
             # A missing reading is taken for the node's own, as `control` does.
             known = torch.where(sequence.isnan(), self.hmm.emission_mean[path], sequence).detach()
             samples = (path, known.float(), actions, self.config.horizon)
+            recognized.append(samples[:3])
             forward.append(assign_triplets(*samples))
             backward.append(assign_reversed(*samples))
         triplets = concatenate(forward)
@@ -423,6 +436,9 @@ class Agent:
         self.samples = latest(triplets, MOST_SAMPLES)
         if monitor is not None:
             monitor.scalar("controllers/loss", loss, len(self.record))
+        is_steered = self.config.steers and not self.is_reversible and len(triplets.node) > 0
+        self.memory = remember(recognized) if is_steered else None
+        self._motion = None
         self._prepare_planning()
 
     def _train_bank(self, triplets: Triplets) -> float:
@@ -520,10 +536,17 @@ class Agent:
         low, high = self.action_bounds
         return ((low + high) / 2).astype(np.float32)
 
-    def normalize(self, observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Bring raw readings (..., D) to the range [0, 1] that the log had.
+    @property
+    def motion(self) -> Motion | None:
+        """What choices lead to; None where the agent acts by its map and controllers alone."""
+        if self._motion is None and self.memory is not None:
+            self._motion = Motion(self.memory)
+        return self._motion
 
-        Readings that never changed in the log are left out: the last axis may become shorter.
+    def normalize(self, observations: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Bring raw readings (..., D) to the range [0, 1] that the log had, (..., E).
+
+        Readings that never changed in the log are left out; one found to wrap becomes two.
         """
         values = np.asarray(observations, np.float64)
         if values.shape[-1:] != self.observation_low.shape:
@@ -533,7 +556,9 @@ class Agent:
             )
         (used,) = np.nonzero(self.observation_scale > 0)
         kept = np.take(values, used, axis=-1)
-        return (kept - self.observation_low[used]) / self.observation_scale[used]
+        kept = (kept - self.observation_low[used]) / self.observation_scale[used]
+        period = self.observation_period[used]
+        return unwrap_to_circles(kept, period) if period.any() else kept
 
     def recognize(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,)."""
@@ -656,9 +681,13 @@ class Agent:
             "is_reversible": torch.tensor(self.is_reversible),
             "observation_low": torch.from_numpy(self.observation_low),
             "observation_scale": torch.from_numpy(self.observation_scale),
+            "observation_period": torch.from_numpy(self.observation_period),
             "action_low": torch.from_numpy(self.action_bounds[0]),
             "action_high": torch.from_numpy(self.action_bounds[1]),
         }
+        if self.memory is not None:
+            memory = self.memory._asdict()
+            state |= {f"memory.{name}": torch.from_numpy(value) for name, value in memory.items()}
         save_checkpoint(Path(path), {"agent": self.config.to_json(), "seed": self.seed}, state)
 
     @classmethod
@@ -691,6 +720,7 @@ class Agent:
         )
         self.observation_low = state["observation_low"].numpy()
         self.observation_scale = state["observation_scale"].numpy()
+        self.observation_period = state["observation_period"].numpy()
         self.action_bounds = (state["action_low"].numpy(), state["action_high"].numpy())
         self.look_radius = float(state["look_radius"])
         self.edges = _sparse(state["edges.pair"], state["edges.count"], self.num_nodes)
@@ -707,6 +737,8 @@ class Agent:
         self.is_reversible = bool(state["is_reversible"])
         self.bank = make_bank(config.controller, self.num_nodes, sizes["D"], sizes["A"])
         self.bank.load_state_dict(_with_prefix(state, "bank."))
+        memory = {name: t.numpy() for name, t in _with_prefix(state, "memory.").items()}
+        self.memory = Memory(**memory) if memory else None
         self._prepare_recognition()
         self._prepare_planning()
         pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()
@@ -723,6 +755,8 @@ class Agent:
             layout["statistics"] = (torch.float64, "x")
         if "counts.weight" in state:
             layout |= {f"counts.{x}": (torch.float64, "ND") for x in ("weight", "first", "second")}
+        if "memory.node" in state:
+            layout |= MEMORY_LAYOUT
         layout |= BANK_LAYOUTS[self.config.controller]
         sizes = check_layout(state, layout)
         num_nodes, obs_dim, action_dim = (sizes[letter] for letter in "NDA")
@@ -735,13 +769,23 @@ class Agent:
             raise ValueError(f"the bank's inputs don't fit {obs_dim} readings")
         for name in ("edges.pair", "blame.pair", "samples.node"):
             check_index(name, state[name], num_nodes)
+        if "memory.node" in state:
+            check_index("memory.node", state["memory.node"], num_nodes)
+            check_index("memory.start", state["memory.start"], sizes["Q"])
         if "bank.num_samples" in state:
             check_index("bank.num_samples", state["bank.num_samples"], sizes["S"] + 1)
         if sizes["2"] != 2:
             raise ValueError(f"edges.pair has {sizes['2']} columns, needs 2")
         if sizes["W"] != len(directions(action_dim)):
             raise ValueError(f"tried has {sizes['W']} columns, needs one a direction")
-        for name in ("edges.count", "tried", "observation_scale", "counts.weight", "look_radius"):
+        for name in (
+            "edges.count",
+            "tried",
+            "observation_scale",
+            "observation_period",
+            "counts.weight",
+            "look_radius",
+        ):
             if name in state and (state[name] < 0).any():
                 raise ValueError(f"{name} has a number below zero")
         if state["look_radius"] == 0:
@@ -755,7 +799,8 @@ class Agent:
             raise ValueError(f"hmm.emission_mean has numbers beyond {MAX_READING:g}")
         if (state["action_low"] > state["action_high"]).any():
             raise ValueError("action_low is above action_high")
-        if int((state["observation_scale"] > 0).sum()) != obs_dim:
+        num_used = int((state["observation_scale"] > 0).sum())
+        if num_used + int((state["observation_period"] > 0).sum()) != obs_dim:
             raise ValueError(f"observation_scale doesn't have {obs_dim} readings in use")
         cells = math.prod(self.config.shape)
         if cells > MOST_CELLS and cells > MOST_CELLS_A_NODE * num_nodes:
@@ -764,6 +809,13 @@ class Agent:
             )
         return sizes
 
+
+MEMORY_LAYOUT: Layout = {
+    "memory.observation": (torch.float32, "QD"),
+    "memory.action": (torch.float32, "QA"),
+    "memory.node": (torch.int64, "Q"),
+    "memory.start": (torch.int64, "L"),
+}
 
 LAYOUT: Layout = {
     "hmm.successor": (torch.int64, "NK"),
@@ -783,6 +835,7 @@ LAYOUT: Layout = {
     "is_reversible": (torch.bool, ""),
     "observation_low": (torch.float64, "R"),
     "observation_scale": (torch.float64, "R"),
+    "observation_period": (torch.float64, "R"),
     "action_low": (torch.float32, "A"),
     "action_high": (torch.float32, "A"),
     "samples.observation": (torch.float32, "MD"),

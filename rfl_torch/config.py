@@ -51,6 +51,8 @@ class AgentConfig:
     """Distance on the lattice; "chebyshev" with radius 2 joins 24 neighbours."""
     boundary: Boundary = "open"
     """"torus" joins opposite borders of the lattice."""
+    unwraps: bool = True
+    """Lay readings that the log shows to wrap, as an angle does, on a circle; see `circle`."""
     start: Literal["equal", "data"] = "data"
     """"equal" is the paper's mean 0.5 and scale 0.05 for all nodes; "data" the log's own."""
     counted_readings: float | None = 7.2
@@ -72,6 +74,10 @@ class AgentConfig:
     """Furthest target of a controller's training triplets, steps; the paper's is the next step."""
     uses_reversal: bool = True
     """Learn from the log run backwards too, if the log shows that the world allows it."""
+    steers: bool = True
+    """Where the log shows that the world isn't reversible, choose actions by what they lead to from
+    the last two observations (`motion`, `steering`). The paper's controllers see the last one
+    alone, and no velocity in it."""
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
     """How goals are pursued."""
 
@@ -85,6 +91,8 @@ class AgentConfig:
             controller="svr",
             repairs=False,
             uses_reversal=False,
+            unwraps=False,
+            steers=False,
             executor=ExecutorConfig(recognition="path"),
         )
 
@@ -92,6 +100,20 @@ class AgentConfig:
     def paper_pendulum(cls) -> "AgentConfig":
         """The paper's choices for section 4: 22 x 22 nodes and no sub-sampling."""
         return dataclasses.replace(cls.paper(), shape=(22, 22), stages=paper_stages((1,)))
+
+    @classmethod
+    def smooth(cls) -> "AgentConfig":
+        """For a few smooth readings whose changes are hidden, such as a pendulum's angle.
+
+        On a torus a sheet of velocities has no border to fold at. Every step is learned from: at
+        20 rad/s a pendulum is past a node in one.
+        """
+        return cls(
+            shape=(28, 28),
+            metric="chebyshev",
+            boundary="torus",
+            stages=(Stage(1, 240, (0.01, 1.0), pseudo_count=0.01, min_scale=0.04, tolerance=0.0),),
+        )
 
     def power(self, obs_dim: int) -> float:
         """Power of the emission densities of `obs_dim` readings, in learning and recognition."""

@@ -21,6 +21,7 @@ from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
 from rfl_torch.repair import LOOK_STEPS
 from rfl_torch.search import Search
 from rfl_torch.senses import FEW, believed, sensible
+from rfl_torch.steering import SteeringExecutor
 
 if TYPE_CHECKING:
     from rfl_torch.agent import Agent
@@ -337,7 +338,7 @@ class BeliefExecutor:
             self._babble_left = min(2 * self._failures, 20)
 
 
-Executor = PathExecutor | BeliefExecutor
+Executor = PathExecutor | BeliefExecutor | SteeringExecutor
 
 
 def make_executor(
@@ -346,4 +347,6 @@ def make_executor(
     """The executor that the agent's configuration asks for; `sight` is a goal's observation."""
     if agent.config.executor.recognition == "path":
         return PathExecutor(agent, goals, seed)
+    if agent.motion is not None:
+        return SteeringExecutor(agent, agent.motion, goals, seed)
     return BeliefExecutor(agent, goals, seed, sight)

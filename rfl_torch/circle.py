@@ -1,0 +1,60 @@
+"""Readings that wrap, as an angle does: laid on a circle, they lose the jump that isn't there.
+
+The paper keeps the pendulum's angle raw in [0, 1], where upright is torn into 0 and 1. Laid out as
+(cos, sin), what is close looks close. Whether a reading wraps shows in the log: it jumps, but never
+without leaving one end of its range for the other at the pace that it had.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_JUMPS = 3
+"""Fewer jumps don't show that a reading wraps."""
+
+PACE_ERROR = 0.05
+"""Share of the range that the pace may change by over a jump."""
+
+
+def find_periods(logs: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Period of each reading in the readings' unit, (D,); 0 where it doesn't wrap.
+
+    A jump is a change by over half of the range; at every one, the change after taking a period off
+    must be between that before and that after it. The period is the one that makes it their mean.
+
+    Args:
+        logs: raw readings, (T, D) each; NaN is a missing one.
+    """
+    low, high = (f(np.concatenate(logs), 0) for f in (np.nanmin, np.nanmax))
+    return np.array(
+        [_period([log[:, d] for log in logs], high[d] - low[d]) for d in range(len(low))]
+    )
+
+
+def _period(logs: list[NDArray[np.float64]], extent: float) -> float:
+    periods = []
+    for reading in logs:
+        step = np.diff(reading)
+        is_jump = np.abs(step) > extent / 2
+        within = step - np.sign(step) * extent * is_jump
+        jump = np.flatnonzero(is_jump[1:-1]) + 1
+        pace = (within[jump - 1] + within[jump + 1]) / 2
+        periods.append(np.sign(step[jump]) * (step[jump] - pace))
+    period = np.concatenate(periods)
+    if len(period) < MIN_JUMPS or not (np.abs(period - extent) < PACE_ERROR * extent).all():
+        return 0.0
+    return float(np.median(period))
+
+
+def unwrap_to_circles(
+    readings: NDArray[np.float64], period: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Replace each reading that wraps by (1 + cos) / 2 and (1 + sin) / 2, at the end of the row.
+
+    Args:
+        readings: (..., D).
+        period: (D,), 0 where a reading doesn't wrap.
+    """
+    wraps = period > 0
+    angle = 2 * np.pi * readings[..., wraps] / period[wraps]
+    circle = [0.5 + 0.5 * np.cos(angle), 0.5 + 0.5 * np.sin(angle)]
+    return np.concatenate([readings[..., ~wraps], *circle], -1)

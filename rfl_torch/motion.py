@@ -1,0 +1,330 @@
+"""What the log tells about motion: what each choice would lead to, from anywhere in it.
+
+Where a node can't be waited in and no edge can be walked backwards, a map isn't enough to act on:
+the same node is passed at many speeds, and one step's action shows only in what follows. So there
+a controller knows a short history and looks forward instead of back:
+
+    x_t = (o_t, o_t - o_t-1)                     a situation: where things are, and how they go
+    (o_t+1, .., o_t+K) = g_l(x_t, u)             local models, one a landmark, with u held
+
+in place of u_t = f_j(o_t, o_t+1) (eq. 12). Landmarks are situations of the log, evenly spread, and
+others that the models say can be reached from them. A choice is held until it has led about two
+spacings on, so a landmark is left whatever the speed, as a node is when its edge is taken.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+Array = NDArray[np.float64]
+
+MAX_CHOICES = 9
+"""A log with more distinct actions is taken to have continuous ones."""
+
+
+HORIZON = 12
+"""K: control steps that a choice is held for at most."""
+
+MOVE = 2.0
+"""Landmark spacings that a choice leads on. At 1 the interpolation between landmarks blurs as much
+as a choice changes; at 3 standing upright is left to fewer, coarser choices."""
+
+NUM_LANDMARKS = 4000
+"""At most."""
+
+NUM_SEEN = 2000
+"""Of them, situations of the log."""
+
+SAMPLES_PER_WEIGHT = 6
+"""A local model is fitted to that many of the nearest samples for each of its weights."""
+
+NEIGHBORS = 6
+"""Landmarks that a situation is interpolated between."""
+
+MIN_SAMPLES = 100
+"""Steps that motion can be learned from at all."""
+
+TRUST = 1.5
+"""Spacings from the log within which the models are believed: at 3, a ninth of the choices from
+imagined landmarks is wrong by over 1 rad/s on the pendulum."""
+
+STRAY = 3.0
+"""Spacings from the landmarks from which on a situation counts as off them."""
+
+RIDGE = 1e-6
+"""Of the local fits, whose inputs are of order one: only keeps them solvable."""
+
+FIT_BLOCK = 500
+"""Landmarks fitted at once, for memory's sake."""
+
+
+class Memory(NamedTuple):
+    """The recognised logs that motion is learned from.
+
+    observation: float32 (M, E) normalised, all logs in a row.
+    action: float32 (M, A) in [0, 1]; the row at a log's last observation means nothing.
+    node: int64 (M,).
+    start: int64 (L,), where each log begins.
+    """
+
+    observation: NDArray[np.float32]
+    action: NDArray[np.float32]
+    node: NDArray[np.int64]
+    start: NDArray[np.int64]
+
+
+def remember(logs: list[tuple[Tensor, Tensor, Tensor]]) -> Memory | None:
+    """Join recognised logs, each given as node (T+1,), observation (T+1, E) and action (T, A).
+
+    None if they hold too few steps to learn motion from.
+    """
+    node, observation, action = zip(*logs, strict=True)
+    length = [len(path) for path in node]
+    memory = Memory(
+        np.concatenate([own.numpy() for own in observation]),
+        np.concatenate([np.concatenate([own.numpy(), own.numpy()[-1:]]) for own in action]),
+        np.concatenate([own.numpy() for own in node]),
+        np.cumsum([0, *length[:-1]]),
+    )
+    return memory if len(_inner_rows(memory)) >= MIN_SAMPLES else None
+
+
+def remember_more(memory: Memory, node: Tensor, observation: Tensor, action: Tensor) -> Memory:
+    """Take one more recognised log into the memory; shapes as in `remember`."""
+    last = action[-1:]
+    return Memory(
+        np.concatenate([memory.observation, observation.numpy()]),
+        np.concatenate([memory.action, action.numpy(), last.numpy()]),
+        np.concatenate([memory.node, node.numpy()]),
+        np.append(memory.start, len(memory.node)),
+    )
+
+
+def choices(action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The actions (C, A) to choose from: the log's own, if it has few, else the ends of each axis.
+
+    Args:
+        action: those of the log, (T, A).
+    """
+    distinct = np.unique(action, axis=0)
+    if len(distinct) <= MAX_CHOICES:
+        return distinct
+    low, high = action.min(0), action.max(0)
+    middle = np.tile((low + high) / 2, (2 * len(low) + 1, 1))
+    for axis in range(len(low)):
+        middle[2 * axis + 1, axis], middle[2 * axis + 2, axis] = low[axis], high[axis]
+    return middle
+
+
+class Prospect(NamedTuple):
+    """What every choice would lead to, from B situations."""
+
+    trace: Array
+    """(B, C, K, 2 E) the situations after 1..K steps."""
+    num_steps: NDArray[np.int64]
+    """(B, C) steps that the choice is held for, 1..K."""
+
+    @property
+    def end(self) -> Array:
+        """(B, C, 2 E) the situations that the choices end in."""
+        return np.take_along_axis(self.trace, self.num_steps[..., None, None] - 1, 2)[:, :, 0]
+
+    @property
+    def is_held(self) -> NDArray[np.bool_]:
+        """(B, C, K) whether the choice is still held."""
+        return np.arange(1, self.trace.shape[2] + 1) <= self.num_steps[..., None]
+
+
+class Motion:
+    """Landmarks with their local models, and where each choice leads from each of them.
+
+    Distances between situations are taken over `scale`: the observations' spread and that of their
+    changes count alike.
+
+    Args:
+        memory: recognised logs.
+    """
+
+    def __init__(self, memory: Memory) -> None:
+        self.memory = memory
+        self.obs_dim = memory.observation.shape[1]
+        rows = _inner_rows(memory)
+        observation, action = memory.observation.astype(np.float64), memory.action
+        now, before = observation[rows], observation[rows - 1]
+        self.choices = choices(action[rows])
+        spread = [np.maximum(part.std(0).mean(), 1e-9) for part in (now, now - before)]
+        self.scale = np.repeat(spread, self.obs_dim)
+        situation = np.concatenate([now, now - before], 1) / self.scale
+        self._log_tree, self._log_node = cKDTree(situation), memory.node[rows]
+        self._learn_from(rows, situation, observation, action)
+        landmark = situation[spread_out(situation, NUM_SEEN)]
+        self.spacing = float(cKDTree(landmark).query(landmark, 2)[0][:, 1].mean())
+        self._set_landmarks(self._explore(landmark))
+
+    def _learn_from(
+        self,
+        rows: NDArray[np.int64],
+        situation: Array,
+        observation: Array,
+        action: NDArray[np.float32],
+    ) -> None:
+        """Gather the samples whose action was held for K steps; of those the models are made."""
+        ahead = rows[:, None] + np.arange(HORIZON)
+        is_held = (action[ahead] == action[rows][:, None]).all((1, 2))
+        if is_held.sum() < len(rows) / 10:  # a log of ever new actions: their means will do
+            is_held[:] = True
+        rows, ahead, situation = rows[is_held], ahead[is_held], situation[is_held]
+        held = action[ahead].mean(1)
+        self._sample = self._inputs(situation, held)
+        change = observation[ahead + 1] - observation[rows][:, None]
+        self._sample_change = change.reshape(len(rows), -1)
+        # Neighbours in the log are often of one action, and say nothing of what others do.
+        kind = ((held[:, None] - self.choices) ** 2).sum(-1).argmin(1)
+        self._kinds = [np.flatnonzero(kind == k) for k in np.unique(kind)]
+        self._kind_trees = [cKDTree(situation[own]) for own in self._kinds]
+
+    @staticmethod
+    def _inputs(scaled: Array, held: NDArray[np.float32]) -> Array:
+        """Rows (x_t, u, 1) that the models are linear in."""
+        return np.concatenate([scaled, held, np.ones((len(scaled), 1))], 1)
+
+    def _fit(self, scaled: Array) -> Array:
+        """Local linear models around situations (B, 2 E), (B, I, K E).
+
+        Ridge regressions on the nearest samples, as many of each choice.
+        """
+        each = -(-SAMPLES_PER_WEIGHT * self._sample.shape[1] // len(self._kinds))
+        near = np.concatenate(
+            [
+                own[tree.query(scaled, range(1, min(each, len(own)) + 1))[1]]
+                for own, tree in zip(self._kinds, self._kind_trees, strict=True)
+            ],
+            1,
+        )
+        blocks = []
+        for first in range(0, len(scaled), FIT_BLOCK):
+            block = near[first : first + FIT_BLOCK]
+            inputs, change = self._sample[block], self._sample_change[block]
+            gram = inputs.mT @ inputs + RIDGE * np.eye(inputs.shape[2])
+            blocks.append(np.linalg.solve(gram, inputs.mT @ change))
+        return np.concatenate(blocks)
+
+    def _explore(self, landmark: Array) -> Array:
+        """Add situations that choices lead to, where none is near but the log is."""
+        front = landmark
+        while len(landmark) < NUM_LANDMARKS:
+            prospect = self._prospect(front * self.scale, self._fit(front))
+            end = prospect.end.reshape(-1, len(self.scale)) / self.scale
+            end = end[self._log_tree.query(end)[0] < TRUST * self.spacing]
+            end = end[cKDTree(landmark).query(end)[0] > self.spacing]
+            front = apart(end, self.spacing)[: NUM_LANDMARKS - len(landmark)]
+            if not len(front):
+                break
+            landmark = np.concatenate([landmark, front])
+        return landmark
+
+    def _set_landmarks(self, landmark: Array) -> None:
+        self.landmark = landmark * self.scale
+        self._tree, self._weight = cKDTree(landmark), self._fit(landmark)
+        self.node = self._log_node[self._log_tree.query(landmark)[1]]
+        self.prospect = self._prospect(self.landmark, self._weight)
+        num, num_choices = len(landmark), len(self.choices)
+        near, weight = self.interpolate(self.prospect.end.reshape(num * num_choices, -1))
+        width = near.shape[1]
+        self.leads_to = [
+            csr_array(
+                (
+                    weight[choice::num_choices].ravel(),
+                    near[choice::num_choices].ravel(),
+                    np.arange(num + 1) * width,
+                ),
+                shape=(num, num),
+            )
+            for choice in range(num_choices)
+        ]
+
+    # -- looking ahead ------------------------------------------------------------------------
+
+    def look_ahead(self, situation: Array) -> Prospect:
+        """What every choice leads to from situations (B, 2 E)."""
+        nearest = self._tree.query(situation / self.scale)[1]
+        return self._prospect(situation, self._weight[nearest])
+
+    def _prospect(self, situation: Array, weight: Array) -> Prospect:
+        scaled, traces = situation / self.scale, []
+        now = situation[:, None, : self.obs_dim]
+        for choice in self.choices:
+            inputs = self._inputs(scaled, np.tile(choice, (len(scaled), 1)))
+            change = (inputs[:, None] @ weight)[:, 0].reshape(len(scaled), HORIZON, self.obs_dim)
+            course = np.concatenate([now, now + change], 1)
+            traces.append(np.concatenate([course[:, 1:], np.diff(course, axis=1)], -1))
+        trace = np.stack(traces, 1)
+        moved = np.linalg.norm((trace - situation[:, None, None]) / self.scale, axis=-1)
+        has_left = moved > MOVE * self.spacing
+        has_left[..., -1] = True
+        return Prospect(trace, has_left.argmax(-1) + 1)
+
+    def interpolate(self, situation: Array) -> tuple[NDArray[np.int64], Array]:
+        """The landmarks around situations (B, 2 E) and their weights, (B, NEIGHBORS) each."""
+        num = min(NEIGHBORS, len(self.landmark))
+        distance, near = self._tree.query(situation / self.scale, num)
+        distance, near = distance.reshape(-1, num), near.reshape(-1, num)
+        # Falls to zero at the furthest, so that the interpolation has no jumps.
+        taper = np.maximum(1.0 - (0.999 * distance / distance[:, -1:].clip(1e-12)) ** 2, 1e-6)
+        weight = taper / (distance**2 + (0.1 * self.spacing) ** 2)
+        return near, weight / weight.sum(1, keepdims=True)
+
+    def stray(self, situation: Array) -> Array:
+        """How far situations (..., 2 E) lie off the landmarks, in units of STRAY, from 0 on."""
+        distance = self._tree.query(situation / self.scale)[0]
+        return np.maximum(distance / (STRAY * self.spacing) - 1.0, 0.0)
+
+    def nearest_node(self, situation: Array) -> NDArray[np.int64]:
+        """Node of the log's nearest situation, (...,), for situations (..., 2 E)."""
+        return self._log_node[self._log_tree.query(situation / self.scale)[1]]
+
+    def center(self, node: int) -> Array | None:
+        """Mean situation of a node's steps in the logs, (2 E,); None if it has none."""
+        own: Array = np.asarray(self._log_tree.data)[self._log_node == node]
+        return np.asarray(own.mean(0) * self.scale) if len(own) else None
+
+
+def _inner_rows(memory: Memory) -> NDArray[np.int64]:
+    """Rows that have an observation before them and K after them in the same log."""
+    ends = [*memory.start[1:].tolist(), len(memory.observation)]
+    spans = [
+        np.arange(start + 1, end - HORIZON)
+        for start, end in zip(memory.start.tolist(), ends, strict=True)
+    ]
+    rows = np.concatenate(spans)
+    is_missing = np.isnan(memory.observation).any(1).astype(np.int64)
+    missing = np.concatenate([[0], is_missing.cumsum()])  # before each row
+    return np.asarray(rows[missing[rows + HORIZON + 1] == missing[rows - 1]])
+
+
+def spread_out(points: Array, num: int) -> NDArray[np.int64]:
+    """Indices of `num` of the points, each as far as can be from those before it."""
+    num = min(num, len(points))
+    chosen, distance = np.zeros(num, np.int64), np.full(len(points), np.inf)
+    for i in range(1, num):
+        away = points - points[chosen[i - 1]]
+        distance = np.minimum(distance, np.einsum("ij,ij->i", away, away))
+        chosen[i] = distance.argmax()
+    return chosen
+
+
+def apart(points: Array, distance: float) -> Array:
+    """Those points, taken in order, that lie further than `distance` from all taken before."""
+    if not len(points):
+        return points
+    tree, is_left_out = cKDTree(points), np.zeros(len(points), bool)
+    taken = []
+    for i, point in enumerate(points):
+        if not is_left_out[i]:
+            taken.append(i)
+            is_left_out[tree.query_ball_point(point, distance)] = True
+    return points[taken]
