@@ -8,11 +8,14 @@ without leaving one end of its range for the other at the pace that it had.
 import numpy as np
 from numpy.typing import NDArray
 
-MIN_JUMPS = 3
-"""Fewer jumps don't show that a reading wraps."""
+MIN_JUMPS = 10
+"""Fewer jumps don't show that a reading wraps: a ray that flickers may do as much."""
 
-PACE_ERROR = 0.05
+PACE_ERROR = 0.01
 """Share of the range that the pace may change by over a jump."""
+
+GAP = 0.05
+"""Share of the period that the log may leave out."""
 
 
 def find_periods(logs: list[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -40,9 +43,12 @@ def _period(logs: list[NDArray[np.float64]], extent: float) -> float:
         pace = (within[jump - 1] + within[jump + 1]) / 2
         periods.append(np.sign(step[jump]) * (step[jump] - pace))
     period = np.concatenate(periods)
-    if len(period) < MIN_JUMPS or not (np.abs(period - extent) < PACE_ERROR * extent).all():
+    period = period[np.isfinite(period)]
+    if len(period) < MIN_JUMPS:
         return 0.0
-    return float(np.median(period))
+    usual = float(np.median(period))
+    is_smooth = bool((np.abs(period - usual) < PACE_ERROR * extent).all())
+    return usual if is_smooth and abs(usual - extent) < GAP * extent else 0.0
 
 
 def unwrap_to_circles(

@@ -311,3 +311,9 @@ def test_on_the_circle_the_ends_of_the_range_meet():
     reading = np.array([[0.0, 0.3], [1.0, 0.3], [0.5, 0.3]])
     circle = unwrap_to_circles(reading, np.array([1.0, 0.0]))
     np.testing.assert_allclose(circle, [[0.3, 1, 0.5], [0.3, 1, 0.5], [0.3, 0, 0.5]], atol=1e-12)
+
+
+def test_a_ray_that_flickers_from_one_end_of_its_range_to_the_other_does_not_wrap():
+    rng = np.random.default_rng(0)
+    ray = np.where(rng.random(4000) < 0.05, 0.0, 1.0) - 0.1 * rng.random(4000)
+    assert not find_periods([ray[:, None]]).any()
