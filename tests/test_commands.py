@@ -299,3 +299,10 @@ def test_crash_while_writing_leaves_the_older_file(tmp_path):
 def test_table_aligns_its_columns():
     lines = cli.table(["name", "share"], [["a", "1"], ["long name", "100 %"]]).splitlines()
     assert lines == ["name       share", "---------  -----", "a              1", "long name  100 %"]
+
+
+def test_the_goal_of_a_swing_up_is_the_slowest_node_well_inside_the_tolerance():
+    mean = np.array([[3.1, 5.0], [-3.05, -2.0], [2.9, 0.0], [0.0, 0.0], [np.nan, np.nan]])
+    table = scoring.NodeTable(mean, np.zeros_like(mean), np.ones(5, np.int64))
+    assert reproduce.upright_node(table) == 1
+    assert reproduce.upright_node(table._replace(mean=mean[2:])) == 0

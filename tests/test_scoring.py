@@ -1,5 +1,6 @@
 """`experiments.scoring` against scipy and hand-made maps: nobody gets credit that is not due."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -356,3 +357,23 @@ def test_forecasts_of_a_models_own_samples_are_as_sure_as_right():
     agent.hmm.emission_log_scale.data += 0.7  # twice as unsure as right
     wide = scoring.forecast_ranks(agent, log, (1,), 1000, np.random.default_rng(1))[1]
     assert (scoring.held_shares(wide, nominal) > nominal + 0.03).mean() > 0.7
+
+
+def test_the_longest_stay_counts_unbroken_steps_near_the_target():
+    class Line:
+        def __init__(self, truths):
+            self._truths = iter(truths)
+
+        def step(self, action):
+            truth = np.array([next(self._truths), 0.0])
+            return truth, 0.0, False, False, {"ground_truth": truth}
+
+    class Still:
+        def act(self, observation):
+            return np.zeros(1)
+
+    world = dataclasses.replace(PENDULUM, limit=7)
+    task = Task(0, np.array([np.pi, 0.0]))
+    outcome = Outcome("reached", 0, None, np.zeros(0, np.int64), [], np.zeros(1), {})
+    env = Line([3.1, -3.1, 0.0, 3.0, 3.2, 3.3, 0.0])
+    assert scoring.longest_stay(env, Still(), outcome, task, world) == 3
