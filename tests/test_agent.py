@@ -215,7 +215,12 @@ def test_a_foreign_format_is_refused(tmp_path):
 
 
 def test_configurations_survive_json():
-    for config in (AgentConfig(), AgentConfig.paper(), AgentConfig.paper_pendulum()):
+    for config in (
+        AgentConfig(),
+        AgentConfig.smooth(),
+        AgentConfig.paper(),
+        AgentConfig.paper_pendulum(),
+    ):
         assert AgentConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
     with pytest.raises(ValueError, match="doesn't fit"):
         AgentConfig.from_json({"shape": [3, 3], "unknown": 1})
