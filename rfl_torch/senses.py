@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FEW = 0.15
-"""Share of the readings that may be wrong wherever the robot is."""
+FEW = 0.09
+"""Share of the readings that may be wrong wherever the robot is: two of 24. With 0.15 a robot off
+its map finds a place that agrees too often: 88 % of independent starts arrive instead of 98 %."""
 
 HALF = 0.5
 """Share that may be wrong where the robot is already thought to be."""
 
-AGREE = 0.7
+AGREE = 0.5
 """Radii of a look within which the readings that are believed must be, on average."""
 
 DOUBTED = 2.0
