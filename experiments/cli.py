@@ -130,6 +130,11 @@ def replacing(path: Path) -> Iterator[Path]:
         new.unlink(missing_ok=True)
 
 
+def unfinished(path: Path) -> Path:
+    """Return where a command keeps what it needs to go on with `path`, should it be killed."""
+    return path.with_name(path.name + ".unfinished")
+
+
 def check_count(name: str, value: int) -> None:
     """Refuse a number of things below one."""
     if value < 1:

@@ -140,7 +140,7 @@ def _run(
         begin = time.perf_counter()
         agent = train.fit(choices, [log], seed, board, f"{label}, train")
         seconds = time.perf_counter() - begin
-        train.save_agent(agent, folder / f"{name}.safetensors")
+        agent.save(folder / f"{name}.safetensors")
         table, truth = scoring.node_table(agent, [log], world), scoring.ground_truth([log])
         kinds = task_sets(env, probe, agent, table, truth, config.trials, seed)
         trials = {

@@ -1,5 +1,8 @@
 """Learn a map and controllers from recorded logs.
 
+Killed and started again with the same options it goes on where it was, from a file OUT.unfinished
+that it keeps meanwhile, and ends with the agent of a run never killed.
+
 python -m experiments.train --log log.npz --out maze.safetensors --logdir runs/maze
 tensorboard --logdir runs
 """
@@ -70,8 +73,10 @@ def main(config: Config) -> None:
         if config.logdir is not None:
             config.logdir.mkdir(parents=True, exist_ok=True)
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
-        agent = fit(choices, logs, config.seed, board)
-    save_agent(agent, config.out)
+        unfinished = cli.unfinished(config.out)
+        agent = fit(choices, logs, config.seed, board, resume=unfinished)
+    agent.save(config.out)  # in one go: a crash leaves an older file whole
+    unfinished.unlink(missing_ok=True)
     print(
         f"{config.out}: {agent.num_nodes} nodes, log-likelihood per step "
         f"{agent.record[-1].log_likelihood_per_step:.3f}, {len(agent.record)} iterations in "
@@ -85,8 +90,12 @@ def fit(
     seed: int,
     board: TensorBoardMonitor | None = None,
     description: str = "train",
+    resume: Path | None = None,
 ) -> Agent:
-    """Return an agent that learned from the logs, with a progress bar over EM iterations."""
+    """Return an agent that learned from the logs, with a progress bar over EM iterations.
+
+    `resume` is the file in which unfinished learning is kept.
+    """
     if board is not None:
         board.config({"seed": seed, "agent": asdict(config)})
     total = sum(stage.iterations for stage in config.stages)
@@ -94,19 +103,13 @@ def fit(
         monitor = BarMonitor(bar, [stage.iterations for stage in config.stages], board)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            agent = Agent(config, seed).fit(logs, monitor=monitor)
+            agent = Agent(config, seed).fit(logs, monitor=monitor, resume=resume)
     if board is not None:
         path = np.concatenate([agent.recognize(log.observations) for log in logs])
         board.nodes(agent.hmm, np.bincount(path, minlength=agent.num_nodes))
     for warning in caught:
         print(f"note: {warning.message}", file=sys.stderr)
     return agent
-
-
-def save_agent(agent: Agent, path: Path) -> None:
-    """Write the agent in one go, so that a crash leaves an older file whole."""
-    with cli.replacing(path) as new:
-        agent.save(new)
 
 
 class BarMonitor:

@@ -5,6 +5,7 @@ recognise the log (2.3), give its triplets to the nodes' controllers (2.4). Exec
 from a fitted agent and leave it unchanged.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -17,7 +18,13 @@ from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from rfl_torch import growth, inference, learning, repair
-from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
+from rfl_torch.checkpoint import (
+    Layout,
+    check_index,
+    check_layout,
+    load_checkpoint,
+    save_checkpoint,
+)
 from rfl_torch.config import AgentConfig
 from rfl_torch.controllers import (
     MLPBank,
@@ -30,11 +37,13 @@ from rfl_torch.controllers import (
     latest,
     pool_sparse_nodes,
 )
-from rfl_torch.executor import Executor, make_executor
-from rfl_torch.hmm import GridHMM, Statistics
+from rfl_torch.executor import BLAME_LIMIT, Executor, make_executor
+from rfl_torch.hmm import MAX_READING, GridHMM, Statistics
+from rfl_torch.innate import directions
 from rfl_torch.online_svr import SVRBank
 from rfl_torch.planner import look_alikes, seen_edges
 from rfl_torch.practice import Attempt, PracticeMonitor, Strategy, practice
+from rfl_torch.resume import SavedLearning, identity
 from rfl_torch.trajectory import Trajectory
 
 Goal = int | NDArray[np.float32] | Callable[[int], bool]
@@ -57,6 +66,13 @@ MOST_SAMPLES = 256
 
 MOST_ROUNDS = 8
 """Times that a repaired map is counted and its logs recognised anew, until all nodes are used."""
+
+MOST_ACTIONS = 1024
+"""Numbers in an action at most, of an agent from a file."""
+
+MOST_CELLS, MOST_CELLS_A_NODE = 10_000, 100
+"""A file's lattice may have so many cells, or so many for each node that is left: all take memory,
+whether a node is left in them or not."""
 
 MIN_STEPS = 10
 """Shortest log that is accepted: the coarsest stage still needs a few steps."""
@@ -103,12 +119,22 @@ class Agent:
     # -- learning ---------------------------------------------------------------------------
 
     def fit(
-        self, logs: Trajectory | list[Trajectory], monitor: AgentMonitor | None = None
+        self,
+        logs: Trajectory | list[Trajectory],
+        monitor: AgentMonitor | None = None,
+        resume: str | Path | None = None,
     ) -> "Agent":
         """Learn everything from one log or several of the same robot.
 
         Readings that never change in any of the logs say nothing and are left out, with a
         warning; the agent still takes them in every observation.
+
+        Args:
+            logs: what was sensed and done.
+            monitor: told of every iteration.
+            resume: file to keep unfinished learning in. Where one of the same logs, choices and
+                seed is there already, learning goes on from it, and ends with the same numbers.
+                Remove it once the agent is saved.
 
         Raises:
             ValueError: if the logs are empty, too short, of different widths, or no reading
@@ -124,7 +150,13 @@ class Agent:
         learning.start(self.hmm, observations, config.start, self.seed)
         power = config.power(self.hmm.obs_dim)
         stages = tuple(stage.tempered(power) for stage in config.stages)
-        self.record = learning.learn(self.hmm, observations, stages, monitor)
+        if resume is None:
+            self.record = learning.learn(self.hmm, observations, stages, monitor)
+        else:
+            own = identity([config.to_json(), self.seed], logs)
+            saved = SavedLearning(Path(resume), own, monitor)
+            record = saved.restore(self.hmm)
+            self.record = learning.learn(self.hmm, observations, stages, saved, record)
         learning.prune(self.hmm, observations, power)
         paths = self._recognize_logs(observations)
         self.look_radius = repair.look_radius(
@@ -551,9 +583,15 @@ class Agent:
         return np.array([likeliest])
 
     def strangeness(self, normal: NDArray[np.float64], node: int) -> float:
-        """How far an observation (D,) is from what a node looks like, in radii of a look."""
+        """How far an observation (D,) is from what a node looks like, in radii of a look.
+
+        NaN if all its readings are missing.
+        """
         difference = np.abs(normal - self._mean[node])
-        return float(difference[~np.isnan(difference)].mean() / self.look_radius)
+        is_there = ~np.isnan(difference)
+        if not is_there.any():
+            return math.nan
+        return float(difference[is_there].mean() / self.look_radius)
 
     def log_emission(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Tempered log-density of one normalised observation (D,) under every node, (N,)."""
@@ -577,8 +615,13 @@ class Agent:
         return self._raw_action(unit)
 
     def _raw_action(self, unit: NDArray[np.float32]) -> NDArray[np.float32]:
-        """From [0, 1] to the action space; what lies outside is shortened, not bent."""
-        offset = unit - 0.5
+        """From [0, 1] to the action space; what lies outside is shortened, not bent.
+
+        A controller that overflows, far from all that it learned from, says nothing: rest.
+        """
+        if not np.isfinite(unit).all():
+            return self.rest_action
+        offset = unit.astype(np.float64) - 0.5
         offset = offset / max(1.0, 2 * float(np.abs(offset).max()))
         low, high = self.action_bounds
         return np.clip(low + (offset + 0.5) * (high - low), low, high).astype(np.float32)
@@ -629,15 +672,23 @@ class Agent:
         try:
             agent = cls(AgentConfig.from_json(config["agent"]), int(config["seed"]))
             agent._restore(state)
-        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            RuntimeError,
+            IndexError,
+            ArithmeticError,
+        ) as error:
             raise ValueError(f"{path} is no agent that this version can use: {error}") from None
         return agent
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         config = self.config
-        obs_dim = state["hmm.emission_mean"].shape[1]
-        self.hmm = GridHMM(config.shape, obs_dim, config.radius, config.metric, config.boundary)
-        self.hmm.restore(_with_prefix(state, "hmm."))
+        sizes = self._check_state(state)
+        self.hmm = GridHMM.of_state(
+            config.shape, config.radius, config.metric, config.boundary, _with_prefix(state, "hmm.")
+        )
         self.observation_low = state["observation_low"].numpy()
         self.observation_scale = state["observation_scale"].numpy()
         self.action_bounds = (state["action_low"].numpy(), state["action_high"].numpy())
@@ -654,13 +705,116 @@ class Agent:
         self.samples = Triplets(**_with_prefix(state, "samples."))
         self.least_familiar = float(state["least_familiar"])
         self.is_reversible = bool(state["is_reversible"])
-        action_dim = len(state["action_low"])
-        self.bank = make_bank(config.controller, self.num_nodes, obs_dim, action_dim)
+        self.bank = make_bank(config.controller, self.num_nodes, sizes["D"], sizes["A"])
         self.bank.load_state_dict(_with_prefix(state, "bank."))
         self._prepare_recognition()
         self._prepare_planning()
         pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()
         self._blame_again([(i, j, factor) for (i, j), factor in zip(pairs, factors, strict=True)])
+
+    def _check_state(self, state: dict[str, Tensor]) -> dict[str, int]:
+        """Make sure that a file's tensors fit together; returns the sizes of `LAYOUT`.
+
+        Raises:
+            ValueError: saying which tensor doesn't fit and why.
+        """
+        layout = dict(LAYOUT)
+        if "statistics" in state:
+            layout["statistics"] = (torch.float64, "x")
+        if "counts.weight" in state:
+            layout |= {f"counts.{x}": (torch.float64, "ND") for x in ("weight", "first", "second")}
+        layout |= BANK_LAYOUTS[self.config.controller]
+        sizes = check_layout(state, layout)
+        num_nodes, obs_dim, action_dim = (sizes[letter] for letter in "NDA")
+        if min(num_nodes, obs_dim, action_dim) < 1 or action_dim > MOST_ACTIONS:
+            raise ValueError(
+                f"has {num_nodes} nodes, {obs_dim} readings and {action_dim} actions; needs at "
+                f"least one of each and at most {MOST_ACTIONS} actions"
+            )
+        if sizes["I"] != 2 * obs_dim or sizes.get("P", 0) not in (0, sizes.get("C", 0) + obs_dim):
+            raise ValueError(f"the bank's inputs don't fit {obs_dim} readings")
+        for name in ("edges.pair", "blame.pair", "samples.node"):
+            check_index(name, state[name], num_nodes)
+        if "bank.num_samples" in state:
+            check_index("bank.num_samples", state["bank.num_samples"], sizes["S"] + 1)
+        if sizes["2"] != 2:
+            raise ValueError(f"edges.pair has {sizes['2']} columns, needs 2")
+        if sizes["W"] != len(directions(action_dim)):
+            raise ValueError(f"tried has {sizes['W']} columns, needs one a direction")
+        for name in ("edges.count", "tried", "observation_scale", "counts.weight", "look_radius"):
+            if name in state and (state[name] < 0).any():
+                raise ValueError(f"{name} has a number below zero")
+        if state["look_radius"] == 0:
+            raise ValueError("look_radius is 0")
+        factor = state["blame.factor"]
+        if ((factor < 0.99) | (factor > 1.01 * BLAME_LIMIT)).any():
+            raise ValueError(f"blame.factor has numbers outside 1 to {BLAME_LIMIT:g}")
+        if state["hmm.emission_log_scale"].abs().max() > 100:
+            raise ValueError("hmm.emission_log_scale has numbers beyond 100")
+        if state["hmm.emission_mean"].abs().max() > MAX_READING:
+            raise ValueError(f"hmm.emission_mean has numbers beyond {MAX_READING:g}")
+        if (state["action_low"] > state["action_high"]).any():
+            raise ValueError("action_low is above action_high")
+        if int((state["observation_scale"] > 0).sum()) != obs_dim:
+            raise ValueError(f"observation_scale doesn't have {obs_dim} readings in use")
+        cells = math.prod(self.config.shape)
+        if cells > MOST_CELLS and cells > MOST_CELLS_A_NODE * num_nodes:
+            raise ValueError(
+                f"its lattice of {self.config.shape} has {cells} cells for {num_nodes} nodes"
+            )
+        return sizes
+
+
+LAYOUT: Layout = {
+    "hmm.successor": (torch.int64, "NK"),
+    "hmm.successor_mask": (torch.bool, "NK"),
+    "hmm.cell": (torch.int64, "N"),
+    "hmm.transition_logits": (torch.float64, "NK"),
+    "hmm.initial_logits": (torch.float64, "N"),
+    "hmm.emission_mean": (torch.float64, "ND"),
+    "hmm.emission_log_scale": (torch.float64, "ND"),
+    "edges.pair": (torch.int64, "E2"),
+    "edges.count": (torch.float64, "E"),
+    "blame.pair": (torch.int64, "F2"),
+    "blame.factor": (torch.float64, "F"),
+    "tried": (torch.float64, "NW"),
+    "look_radius": (torch.float64, ""),
+    "least_familiar": (torch.float64, ""),
+    "is_reversible": (torch.bool, ""),
+    "observation_low": (torch.float64, "R"),
+    "observation_scale": (torch.float64, "R"),
+    "action_low": (torch.float32, "A"),
+    "action_high": (torch.float32, "A"),
+    "samples.observation": (torch.float32, "MD"),
+    "samples.target": (torch.float32, "MD"),
+    "samples.action": (torch.float32, "MA"),
+    "samples.node": (torch.int64, "M"),
+}
+"""What a file holds of every agent: N nodes, D readings in use of R, A actions."""
+
+BANK_LAYOUTS: dict[str, Layout] = {
+    "rbf": {
+        "bank.center": (torch.float32, "NCI"),
+        "bank.bandwidth": (torch.float32, "N"),
+        "bank.weight": (torch.float32, "NPA"),
+        "bank.bias": (torch.float32, "NA"),
+    },
+    "mlp": {
+        "bank.hidden_weight": (torch.float32, "NIH"),
+        "bank.hidden_bias": (torch.float32, "NH"),
+        "bank.linear_weight": (torch.float32, "NDA"),
+        "bank.action_weight": (torch.float32, "NHA"),
+        "bank.action_bias": (torch.float32, "NA"),
+    },
+    "svr": {
+        "bank.support_input": (torch.float64, "NSI"),
+        "bank.target": (torch.float64, "NSA"),
+        "bank.dual_coef": (torch.float64, "NSA"),
+        "bank.bias": (torch.float64, "NA"),
+        "bank.num_samples": (torch.int64, "N"),
+    },
+}
+"""And of its bank."""
 
 
 def _sparse(pair: Tensor, count: Tensor, num_nodes: int) -> csr_array:

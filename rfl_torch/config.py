@@ -4,8 +4,9 @@ Where the paper is silent or its formula cannot be meant as printed, the field s
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from rfl_torch.grid import Boundary, Metric
 from rfl_torch.learning import Stage, paper_stages
@@ -116,6 +117,45 @@ class AgentConfig:
             )
             executor = ExecutorConfig(**values.pop("executor"))
             shape = tuple(int(size) for size in values.pop("shape"))
-            return cls(shape=shape, stages=stages, executor=executor, **values)
+            config = cls(shape=shape, stages=stages, executor=executor, **values)
         except (TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"the configuration doesn't fit this version: {error}") from None
+        _check_fields(config)
+        if config.counted_readings == 0:
+            raise ValueError("counted_readings is 0, needs a positive number or None")
+        if executor.teleport > 1 or executor.blame < 1:
+            raise ValueError(
+                f"teleport is {executor.teleport} and blame {executor.blame}; need a probability "
+                "and a factor of at least 1"
+            )
+        return config
+
+
+def _check_fields(value: Any) -> None:
+    """Make sure that every field of a dataclass has a value of its type; numbers are not negative.
+
+    Raises:
+        ValueError: naming the field.
+    """
+    for name, kind in get_type_hints(type(value)).items():
+        if not _fits(getattr(value, name), kind):
+            raise ValueError(f"{name} is {getattr(value, name)!r}, needs {kind}")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return value in inner
+    if origin is tuple:
+        kinds = inner[:1] * len(value) if inner[1:] == (...,) else inner
+        return len(value) == len(kinds) and all(map(_fits, value, kinds))
+    if inner:  # a union
+        return any(_fits(value, one) for one in inner)
+    if dataclasses.is_dataclass(kind):
+        _check_fields(value)
+        return True
+    if kind in (int, float):
+        numbers = (int,) if kind is int else (int, float)
+        is_number = isinstance(value, numbers) and not isinstance(value, bool)
+        return is_number and (1 if kind is int else 0) <= value < math.inf
+    return isinstance(value, kind)

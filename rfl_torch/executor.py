@@ -20,6 +20,7 @@ from rfl_torch.innate import InnateController
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
 from rfl_torch.repair import LOOK_STEPS
 from rfl_torch.search import Search
+from rfl_torch.senses import FEW, believed, sensible
 
 if TYPE_CHECKING:
     from rfl_torch.agent import Agent
@@ -37,6 +38,10 @@ LOST = 3
 
 FORGOTTEN = 0.01
 """Chance that between two tasks the robot was put at a place that looks the same."""
+
+LONGEST_DOUBT = 60
+"""Steps in a row that the map is followed while many readings don't fit: about a moved wall's
+reach. A robot whose senses are wrong everywhere is lost after that."""
 
 LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
@@ -72,7 +77,7 @@ class PathExecutor:
 
     def watch(self, observation: NDArray[np.float32]) -> None:
         """Follow where the robot is while someone else chooses its actions."""
-        normal = self._agent.normalize(observation)
+        normal = sensible(self._agent.normalize(observation))
         self._window.append(normal)
         self._recognize()
         self.is_familiar = self._agent.strangeness(normal, self.node) <= STRANGE
@@ -148,7 +153,8 @@ class BeliefExecutor:
         self.goal = int(goals[0])
         self._search = Search(*agent.action_bounds, agent.look_radius, seed)
         self.is_familiar = True
-        self._unfamiliar = 0
+        self._unfamiliar = self._weak = 0
+        self._doubts = 0.0
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         self._cost_to_go = cost_to_go(self._cost, goals)
         self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
@@ -177,9 +183,9 @@ class BeliefExecutor:
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action of this control step, (A,), inside the action space."""
         normal = self._agent.normalize(observation)
-        self._recognize(normal)
+        normal = self._recognize(normal)
         is_lost = self._unfamiliar >= LOST
-        is_there = self.belief[self._goals].sum() > 0.5 and self._unfamiliar == 0
+        is_there = self.belief[self._goals].sum() > 0.5 and self.is_familiar
         if self.status == "running" and is_there:
             if self._approach_left == 0 or self._is_in_sight(normal):
                 self.status = "reached"
@@ -209,22 +215,49 @@ class BeliefExecutor:
         away = np.nanmean(np.abs(normal - self._sight))
         return bool(away <= self._agent.look_radius / LOOK_STEPS)
 
-    def _recognize(self, normal: NDArray[np.float64]) -> None:
-        """Filter: push the belief over the edges, allow a teleport, weigh by the emission."""
+    def _recognize(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Filter: push the belief over the edges, allow a teleport, weigh by the emission.
+
+        Returns the readings that are believed; a frame without any leaves what was known.
+        """
+        normal = sensible(normal)
         if self.node < 0:
             self.belief = self._first_belief(normal)
         teleport = self._config.teleport
         pushed = self._agent.transition_in @ self.belief
         predicted = (1 - teleport) * pushed + teleport / len(pushed)
         log_emission = self._agent.log_emission(normal)
-        likeliest = int(log_emission.argmax())
-        self.is_familiar = self._agent.strangeness(normal, likeliest) <= STRANGE
-        self._unfamiliar = 0 if self.is_familiar else self._unfamiliar + 1
+        if not np.isnan(normal).all():
+            normal, log_emission = self._doubt(normal, log_emission, predicted)
         log_belief = np.log(predicted) + log_emission
         belief = np.exp(log_belief - log_belief.max())
         self.belief = belief / belief.sum()
         self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
+        return normal
+
+    def _doubt(
+        self,
+        normal: NDArray[np.float64],
+        log_emission: NDArray[np.float64],
+        predicted: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Leave out readings that don't fit, and take note of how familiar the rest looks."""
+        agent = self._agent
+        self._doubts = 0.0
+        self.is_familiar = agent.strangeness(normal, int(log_emission.argmax())) <= STRANGE
+        if not self.is_familiar:
+            normal, self._doubts = believed(normal, agent._mean, predicted, agent.look_radius)
+            if self._doubts < 1.0:
+                log_emission = agent.log_emission(normal)
+                self.is_familiar = self._doubts <= FEW
+        if self.is_familiar:
+            self._unfamiliar = self._weak = 0
+        elif self._doubts < 1.0 and self._weak < LONGEST_DOUBT:
+            self._unfamiliar, self._weak = 0, self._weak + 1
+        else:
+            self._unfamiliar += 1
+        return normal, log_emission
 
     def _first_belief(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Uniform, or what the last task left, if the robot still sees what it saw then.
@@ -236,7 +269,9 @@ class BeliefExecutor:
         if self._agent.last_seen is None:
             return uniform
         seen, belief = self._agent.last_seen
-        is_same = np.nanmean(np.abs(seen - normal)) <= self._agent.look_radius / LOOK_STEPS
+        away = np.abs(seen - normal)
+        away = away[~np.isnan(away)]
+        is_same = len(away) and away.mean() <= self._agent.look_radius / LOOK_STEPS
         if not is_same or len(belief) != len(uniform):
             return uniform
         return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform

@@ -160,6 +160,25 @@ class GridHMM(nn.Module):
             torch.full((num_nodes, obs_dim), 0.05).double().log()
         )
 
+    @classmethod
+    def of_state(
+        cls,
+        shape: tuple[int, ...],
+        radius: float,
+        metric: Metric,
+        boundary: Boundary,
+        state: dict[str, Tensor],
+    ) -> "GridHMM":
+        """Rebuild a model from its `state_dict`; the lattice itself is not laid out for it.
+
+        Raises:
+            ValueError: as `restore` does.
+        """
+        hmm = cls((1,) * len(shape), state["emission_mean"].shape[1], 1.0, metric, boundary)
+        hmm.shape, hmm.radius, hmm.num_cells = tuple(shape), radius, math.prod(shape)
+        hmm.restore(state)
+        return hmm
+
     def _set_graph(self, successor: Tensor, mask: Tensor, cell: Tensor) -> None:
         self.register_buffer("successor", successor)
         self.register_buffer("successor_mask", mask)

@@ -1,0 +1,64 @@
+"""Which readings of an observation to believe, where no node explains all of them.
+
+A sensor that is dead, stuck or hit by an outlier disagrees with every place; the others still agree
+with one. Readings that don't fit the place that most of them agree on are taken as missing. Where a
+wall was moved, up to half of them don't fit: then only places that the robot may be at are asked.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+FEW = 0.15
+"""Share of the readings that may be wrong wherever the robot is."""
+
+HALF = 0.5
+"""Share that may be wrong where the robot is already thought to be."""
+
+AGREE = 0.7
+"""Radii of a look within which the readings that are believed must be, on average."""
+
+DOUBTED = 2.0
+"""Radii of a look beyond which a reading does not fit."""
+
+LIKELY = 1e-3
+"""Probability of a node from which on the robot may be at it."""
+
+
+FARTHEST = 1e6
+"""Ranges of a reading in the log beyond which a number is no reading."""
+
+
+def sensible(normal: Array) -> Array:
+    """Take infinite and absurd numbers for missing readings."""
+    return np.where(np.abs(normal) <= FARTHEST, normal, np.nan)
+
+
+def believed(normal: Array, mean: Array, predicted: Array, radius: float) -> tuple[Array, float]:
+    """Leave out the readings that don't fit.
+
+    Args:
+        normal: normalised observation (D,).
+        mean: of the nodes, (N, D).
+        predicted: probability of each node before the observation, (N,).
+        radius: of a look.
+
+    Returns:
+        The observation with NaN for what is not believed, and the share that isn't; the
+        observation as it was and 1.0 if it fits no node even so.
+    """
+    num_readings = int((~np.isnan(normal)).sum())
+    difference = np.abs(mean - normal)
+    for share, candidates in ((FEW, None), (HALF, np.flatnonzero(predicted > LIKELY))):
+        kept = num_readings - int(share * num_readings)
+        of = difference if candidates is None else difference[candidates]
+        if not (kept and len(of)):
+            break
+        away = np.partition(of, kept - 1, 1)[:, :kept].mean(1)  # what is missing comes last
+        best = int(away.argmin())
+        if away[best] <= AGREE * radius:
+            node = best if candidates is None else candidates[best]
+            is_wrong = difference[node] > DOUBTED * radius
+            return np.where(is_wrong, np.nan, normal), float(is_wrong.sum() / num_readings)
+    return normal, 1.0
