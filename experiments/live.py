@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from experiments import cli, execute, scoring, train
+from experiments import cli, execute, scoring
 from experiments.drive import Drive
 from experiments.figures import BLUE, GREEN, INK, ORANGE, PALE, RED
 from rfl_torch import Agent
@@ -183,7 +183,7 @@ def build_page(drive: Drive, config: Config) -> None:
                 try:
                     await run.io_bound(drive.practise, config.practice_steps)
                     if config.out is not None:
-                        train.save_agent(drive.agent, config.out)
+                        drive.agent.save(config.out)
                 except Exception as error:  # told on the page, which goes on
                     traceback.print_exc()
                     drive.fail(error)
