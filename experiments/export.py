@@ -83,8 +83,7 @@ def map_graph(agent: Agent, logs: Any = ()) -> nx.DiGraph:
     """
     place, is_true = scoring.node_places(agent, list(logs), None)
     used = np.flatnonzero(agent.observation_scale > 0)
-    mean = agent.hmm.emission_mean.detach().numpy() * agent.observation_scale[used]
-    mean += agent.observation_low[used]
+    mean = agent.raw_readings(agent.hmm.emission_mean.detach().numpy())
     graph = nx.DiGraph()
     for node in range(agent.num_nodes):
         readings = {f"reading_{k}": float(v) for k, v in zip(used, mean[node], strict=True)}
@@ -128,6 +127,11 @@ class Control(nn.Module):
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
+        if agent.observation_period.any() or agent.motion is not None:
+            raise ValueError(
+                "this agent chooses actions by looking ahead; there is no network that answers for "
+                "it. Leave --controllers out, and let the robot's loop call the agent's executor."
+            )
         used = np.flatnonzero(agent.observation_scale > 0)
         low, high = agent.action_bounds
         buffers = {

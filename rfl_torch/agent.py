@@ -25,7 +25,7 @@ from rfl_torch.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from rfl_torch.circle import find_periods, unwrap_to_circles
+from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
 from rfl_torch.config import AgentConfig
 from rfl_torch.controllers import (
     MLPBank,
@@ -192,7 +192,7 @@ class Agent:
         """Learn from more data without starting over.
 
         What the logs show anew becomes new nodes, what they do anew becomes new edges; the nodes
-        that exist keep their numbers. Executors made before go on with the map they know.
+        that exist keep their numbers. Executors made before are of the old map: make new ones.
 
         Raises:
             ValueError: if a log has other readings or actions than those learned from.
@@ -559,6 +559,12 @@ class Agent:
         kept = (kept - self.observation_low[used]) / self.observation_scale[used]
         period = self.observation_period[used]
         return unwrap_to_circles(kept, period) if period.any() else kept
+
+    def raw_readings(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Undo `normalize`: the readings that changed in the log, in the robot's units."""
+        (used,) = np.nonzero(self.observation_scale > 0)
+        readings = wrap_again(normal, self.observation_period[used])
+        return readings * self.observation_scale[used] + self.observation_low[used]
 
     def recognize(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,)."""

@@ -64,3 +64,15 @@ def unwrap_to_circles(
     angle = 2 * np.pi * readings[..., wraps] / period[wraps]
     circle = [0.5 + 0.5 * np.cos(angle), 0.5 + 0.5 * np.sin(angle)]
     return np.concatenate([readings[..., ~wraps], *circle], -1)
+
+
+def wrap_again(laid_out: NDArray[np.float64], period: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Undo `unwrap_to_circles`: (..., E) to readings (..., D), those that wrap in [0, period)."""
+    wraps = period > 0
+    num_plain, num = int((~wraps).sum()), int(wraps.sum())
+    cos, sin = laid_out[..., num_plain : num_plain + num], laid_out[..., num_plain + num :]
+    readings = np.empty((*laid_out.shape[:-1], len(period)))
+    readings[..., ~wraps] = laid_out[..., :num_plain]
+    turn = np.arctan2(sin - 0.5, cos - 0.5) / (2 * np.pi) % 1.0
+    readings[..., wraps] = turn * period[wraps]
+    return readings

@@ -528,6 +528,7 @@ def most_likely_path(chain: Chain, observations: np.ndarray) -> np.ndarray:
 
     The choices of one block are held; those before it are made again from the scores at its start.
     """
+    observations = np.ascontiguousarray(observations, np.float64)  # the kernels index rows
     score = _first_score(chain, observations)
     blocks = list(_blocks(slice(0, len(observations) - 1), _path_block(chain)))
     choice = np.empty((min(len(observations) - 1, _path_block(chain)), chain.num_cells), np.uint16)

@@ -23,7 +23,7 @@ from torch import Tensor
 Array = NDArray[np.float64]
 
 MAX_CHOICES = 9
-"""A log with more distinct actions is taken to have continuous ones."""
+"""A log with more distinct actions has continuous ones: no model of each can be learned."""
 
 
 HORIZON = 12
@@ -81,7 +81,7 @@ class Memory(NamedTuple):
 def remember(logs: list[tuple[Tensor, Tensor, Tensor]]) -> Memory | None:
     """Join recognised logs, each given as node (T+1,), observation (T+1, E) and action (T, A).
 
-    None if they hold too few steps to learn motion from.
+    None if they hold too few steps to learn motion from, or too many distinct actions.
     """
     node, observation, action = zip(*logs, strict=True)
     length = [len(path) for path in node]
@@ -91,12 +91,20 @@ def remember(logs: list[tuple[Tensor, Tensor, Tensor]]) -> Memory | None:
         np.concatenate([own.numpy() for own in node]),
         np.cumsum([0, *length[:-1]]),
     )
-    return memory if len(_inner_rows(memory)) >= MIN_SAMPLES else None
+    if len(_inner_rows(memory)) < MIN_SAMPLES or len(choices(memory.action)) > MAX_CHOICES:
+        return None
+    return memory
 
 
 def remember_more(memory: Memory, node: Tensor, observation: Tensor, action: Tensor) -> Memory:
-    """Take one more recognised log into the memory; shapes as in `remember`."""
+    """Take one more recognised log into the memory; shapes as in `remember`.
+
+    One whose actions make too many choices is left out.
+    """
     last = action[-1:]
+    both = np.concatenate([memory.action, action.numpy()])
+    if len(choices(both)) > MAX_CHOICES:
+        return memory
     return Memory(
         np.concatenate([memory.observation, observation.numpy()]),
         np.concatenate([memory.action, action.numpy(), last.numpy()]),
@@ -106,19 +114,8 @@ def remember_more(memory: Memory, node: Tensor, observation: Tensor, action: Ten
 
 
 def choices(action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The actions (C, A) to choose from: the log's own, if it has few, else the ends of each axis.
-
-    Args:
-        action: those of the log, (T, A).
-    """
-    distinct = np.unique(action, axis=0)
-    if len(distinct) <= MAX_CHOICES:
-        return distinct
-    low, high = action.min(0), action.max(0)
-    middle = np.tile((low + high) / 2, (2 * len(low) + 1, 1))
-    for axis in range(len(low)):
-        middle[2 * axis + 1, axis], middle[2 * axis + 2, axis] = low[axis], high[axis]
-    return middle
+    """The distinct actions (C, A) of a log (T, A): those to choose from."""
+    return np.unique(action, axis=0)
 
 
 class Prospect(NamedTuple):

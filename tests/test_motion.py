@@ -5,12 +5,22 @@ import itertools
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 from worlds import dot_config, dot_log
 
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory
-from rfl_torch.circle import find_periods, unwrap_to_circles
-from rfl_torch.motion import HORIZON, Memory, Motion, apart, choices, spread_out
+from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
+from rfl_torch.motion import (
+    HORIZON,
+    Memory,
+    Motion,
+    apart,
+    choices,
+    remember,
+    remember_more,
+    spread_out,
+)
 from rfl_torch.steering import time_to_goal
 
 STEP = 0.05  # s
@@ -121,15 +131,25 @@ def test_what_a_choice_leads_to_is_what_the_world_does(log, motion):
     assert np.quantile(error, 0.99) < 0.01
 
 
-def test_a_log_of_few_actions_offers_those_and_one_of_many_the_ends_of_each_axis():
+def test_the_choices_are_the_distinct_actions_of_the_log():
     held = np.array([[0.0], [1.0], [0.5], [1.0]], np.float32)
     np.testing.assert_array_equal(choices(held), [[0.0], [0.5], [1.0]])
     one_hot = np.eye(3, dtype=np.float32)[[0, 2, 1, 1]]
     assert {tuple(row) for row in choices(one_hot).tolist()} == {(0, 0, 1), (0, 1, 0), (1, 0, 0)}
-    many = np.random.default_rng(0).random((100, 2)).astype(np.float32)
-    many[:2] = [[0, 0], [1, 1]]
-    expected = [[0.5, 0.5], [0, 0.5], [1, 0.5], [0.5, 0], [0.5, 1]]
-    np.testing.assert_allclose(choices(many), expected)
+
+
+def test_a_log_of_ever_new_actions_teaches_no_motion_nor_spoils_what_is_known():
+    rng = np.random.default_rng(0)
+    node, seen = torch.zeros(301, dtype=torch.int64), torch.from_numpy(rng.random((301, 2))).float()
+    few = torch.from_numpy(rng.integers(3, size=(300, 1)) / 2).float()
+    new = torch.from_numpy(rng.random((300, 1))).float()
+    assert remember([(node, seen, new)]) is None
+    memory = remember([(node, seen, few)])
+    assert remember_more(memory, node, seen, new) is memory
+    longer = remember_more(memory, node, seen, few)
+    both = remember([(node, seen, few)] * 2)
+    for own, other in zip(longer, both, strict=True):
+        np.testing.assert_array_equal(own, other)
 
 
 def test_landmarks_lie_in_the_log_or_near_it_and_no_two_at_one_place(motion):
@@ -310,6 +330,9 @@ def test_jumps_that_are_no_turns_are_not_taken_for_them():
 def test_on_the_circle_the_ends_of_the_range_meet():
     reading = np.array([[0.0, 0.3], [1.0, 0.3], [0.5, 0.3]])
     circle = unwrap_to_circles(reading, np.array([1.0, 0.0]))
+    back = wrap_again(circle, np.array([1.0, 0.0]))
+    away = np.abs(back - reading)
+    assert np.minimum(away, 1.0 - away).max() < 1e-12
     np.testing.assert_allclose(circle, [[0.3, 1, 0.5], [0.3, 1, 0.5], [0.3, 0, 0.5]], atol=1e-12)
 
 
