@@ -4,6 +4,8 @@ python -m experiments.trust resume      kill training and practice at random mom
 python -m experiments.trust files       damage and forge checkpoints
 python -m experiments.trust threads     learn with one thread and with several
 python -m experiments.trust faults      break sensors and walls of the maze
+python -m experiments.trust soak        act and practise for very long
+python -m experiments.trust sizes       the smallest and the largest
 
 Each prints a table; docs/trust.md has them all. What is counted as a failure ends the command with
 status 1.
@@ -12,14 +14,16 @@ status 1.
 import contextlib
 import multiprocessing
 import os
+import resource
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -80,11 +84,37 @@ class Faults:
     """Seed of the first log, its goals and its faults."""
 
 
+@dataclass(frozen=True)
+class Soak:
+    """Execution with goals that change, and practice: memory and step time must not grow."""
+
+    num_steps: int = 1_000_000
+    """Control steps of execution in a room without physics."""
+    maze_steps: int = 20_000
+    """Control steps of execution in the maze."""
+    practice_steps: int = 100_000
+    """Control steps of practice in the room."""
+    seed: int = 0
+    """Seed of everything."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Logs and maps of the smallest and the largest sizes: time, memory, or the refusal."""
+
+    num_steps: int = 1_000_000
+    """Steps of the longest log."""
+    side: int = 100
+    """Nodes along the side of the largest grid."""
+
+
 Config = (
     Annotated[Resume, tyro.conf.subcommand("resume")]
     | Annotated[Files, tyro.conf.subcommand("files")]
     | Annotated[Threads, tyro.conf.subcommand("threads")]
     | Annotated[Faults, tyro.conf.subcommand("faults")]
+    | Annotated[Soak, tyro.conf.subcommand("soak")]
+    | Annotated[Sizes, tyro.conf.subcommand("sizes")]
 )
 
 
@@ -95,6 +125,8 @@ def main(config: Any) -> None:
         Files: try_files,
         Threads: try_threads,
         Faults: try_faults,
+        Soak: try_soak,
+        Sizes: try_sizes,
     }
     if not trials[type(config)](config):
         sys.exit(1)
@@ -232,18 +264,34 @@ def try_files(config: Files) -> bool:
     return failures == 0
 
 
+class Room(gym.Env):
+    """A point in the unit square that feels how far its corners are: all costs are the agent's."""
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(0.0, 1.5, (4,))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,))
+        self._place = np.full(2, 0.5)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Put the point into the middle."""
+        self._place = np.full(2, 0.5)
+        return self._observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Move by up to 0.1."""
+        self._place = np.clip(self._place + 0.1 * np.asarray(action, np.float64), 0, 1)
+        return self._observe(), 0.0, False, False, {}
+
+    def _observe(self) -> Any:
+        corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+        return np.linalg.norm(corners - self._place, axis=1).astype(np.float32)
+
+
 def small_agent(seed: int = 0) -> Agent:
     """Return an agent of a few nodes that has learned from a room of four walls."""
-    rng = np.random.default_rng(seed)
-    actions = rng.uniform(-1, 1, (600, 2)).astype(np.float32)
-    place = np.empty((601, 2))
-    place[0] = 0.5
-    for t, action in enumerate(actions):
-        place[t + 1] = np.clip(place[t] + 0.1 * action, 0, 1)
-    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-    seen = np.linalg.norm(corners - place[:, None], axis=-1)
-    low, high = -np.ones(2, np.float32), np.ones(2, np.float32)
-    log = Trajectory(seen.astype(np.float32), actions, low, high)
+    log = rfl_torch.record(Room(), 600, seed=seed)
     choices = AgentConfig(shape=(5, 5))
     stages = tuple(replace(stage, iterations=12) for stage in choices.stages)
     return Agent(replace(choices, stages=stages), seed).fit(log)
@@ -438,6 +486,145 @@ def try_faults(config: Faults) -> bool:
     outliers = shares["2 % of readings outliers"]
     healthy = shares["healthy"]
     return dead >= DEAD_SHARE * healthy and outliers >= OUTLIER_SHARE * healthy
+
+
+# -- soak ---------------------------------------------------------------------------------------
+
+PARTS = 10
+"""Equal parts of a soak; the last ones are compared with the first but one: the first warms up."""
+
+MOST_GROWTH = 1.1
+"""Of step time, median of the last three parts over that of the second to fourth."""
+
+MOST_MEMORY = 8.0
+"""MB more at the end than after the first part, of an execution; a practice learns."""
+
+
+class Part(NamedTuple):
+    """A part of a soak."""
+
+    microseconds: float
+    """Of the process, for a step."""
+    megabytes: float
+    """Resident at its end."""
+    goals: int
+    """Ended in the part, reached or given up."""
+    worst_sum: float
+    """Largest distance of the belief's sum from one."""
+
+
+def try_soak(config: Soak) -> bool:
+    """Run long; print what the parts took."""
+    agent = small_agent(config.seed)
+    soaks = {"execution": soak_execution(Room(), agent, config.num_steps, config.seed)}
+    if config.maze_steps:
+        env = cli.make_env("rfl/RangefinderMaze-v0", "paper", max_episode_steps=-1)
+        log = rfl_torch.record(env, 5_000, hold=3, seed=config.seed)
+        learned = train.fit(AgentConfig(), [log], config.seed)
+        soaks["in the maze"] = soak_execution(env, learned, config.maze_steps, config.seed)
+        env.close()
+    soaks["practice"] = soak_practice(agent, config.practice_steps, config.seed)
+    header = ["soak", "us a step, early", "late", "MB, early", "late", "goals", "belief off one"]
+    rows, is_good = [], True
+    for name, parts in soaks.items():
+        early, late = (
+            float(np.median([part.microseconds for part in some]))
+            for some in (parts[1:4], parts[-3:])
+        )
+        grown = parts[-1].megabytes - parts[0].megabytes
+        is_flat = late <= MOST_GROWTH * early and grown <= MOST_MEMORY
+        worst = max(part.worst_sum for part in parts)
+        is_good &= (is_flat or name == "practice") and worst < 1e-9
+        memory = f"{parts[0].megabytes:.1f}", f"{parts[-1].megabytes:.1f}"
+        goals = sum(part.goals for part in parts)
+        rows.append([name, f"{early:.0f}", f"{late:.0f}", *memory, str(goals), f"{worst:.1g}"])
+    print(cli.table(header, rows))
+    return is_good
+
+
+def soak_execution(env: Any, agent: Agent, num_steps: int, seed: int) -> list[Part]:
+    """Go to one random node after the other."""
+    rng = np.random.default_rng(seed)
+    seen, _ = env.reset(seed=seed)
+    parts = []
+    low, high = agent.action_bounds
+    executor = agent.executor(0, seed=seed)
+    for _ in tqdm(range(PARTS), desc="soak", unit="part"):
+        begin, goals, worst = time.process_time(), 0, 0.0
+        for _ in range(num_steps // PARTS):
+            if executor.status != "running":
+                goal = int(rng.integers(agent.num_nodes))
+                executor = agent.executor(goal, seed=int(rng.integers(2**31)))
+                goals += 1
+            action = executor.act(seen)
+            worst = max(worst, abs(float(executor.belief.sum()) - 1))
+            if not ((low <= action) & (action <= high)).all():  # true for NaN as well
+                raise RuntimeError(f"the action {action} is outside of {low} to {high}")
+            seen, *_ = env.step(action)
+        seconds = time.process_time() - begin
+        parts.append(Part(1e6 * seconds / (num_steps // PARTS), _resident(), goals, worst))
+    return parts
+
+
+def soak_practice(agent: Agent, num_steps: int, seed: int) -> list[Part]:
+    """Practise part by part."""
+    parts, env = [], Room()
+    for index in tqdm(range(PARTS), desc="practice", unit="part"):
+        begin = time.process_time()
+        history = agent.practice(env, num_steps // PARTS, seed=seed + index)
+        seconds = time.process_time() - begin
+        worst = float((agent.hmm.transition_matrix().sum(1) - 1).detach().abs().max())
+        parts.append(Part(1e6 * seconds / (num_steps // PARTS), _resident(), len(history), worst))
+    return parts
+
+
+def _resident() -> float:
+    """Memory of the process that is in use, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+# -- sizes --------------------------------------------------------------------------------------
+
+
+def try_sizes(config: Sizes) -> bool:
+    """Learn from the smallest and the largest; print seconds, memory, and what was refused."""
+    rows = []
+    cases: list[tuple[str, int, int, int]] = [
+        ("1 node", 2_000, 1, 4),
+        ("1-step log", 1, 5, 4),
+        ("30-step log", 30, 5, 4),
+        ("1 reading", 2_000, 5, 1),
+        ("256 readings", 2_000, 5, 256),
+        (f"{config.side**2} nodes", 2_000, config.side, 8),
+        (f"{config.num_steps} steps", config.num_steps, 10, 4),
+    ]
+    for name, num_steps, side, obs_dim in cases:
+        begin = time.perf_counter()
+        try:
+            num_nodes = _learn_size(num_steps, side, obs_dim)
+            outcome = f"{num_nodes} nodes"
+        except ValueError as error:
+            outcome = f"refused: {str(error)[:60]}..."
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        rows.append([name, f"{time.perf_counter() - begin:.1f}", f"{peak:.0f}", outcome])
+    print(cli.table(["size", "seconds", "peak MB so far", "outcome"], rows))
+    return True
+
+
+def _learn_size(num_steps: int, side: int, obs_dim: int) -> int:
+    """Learn, act once, and return the number of nodes."""
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (num_steps, 2)).astype(np.float32)
+    place = np.abs((0.05 * np.concatenate([np.zeros((1, 2)), actions]).cumsum(0) + 0.5) % 2 - 1)
+    seen = np.sin(place @ rng.uniform(0.5, 3, (2, obs_dim)) + rng.uniform(0, 3, obs_dim))
+    ends = np.ones(2, np.float32)
+    choices = AgentConfig(shape=(side, side))
+    stages = tuple(replace(stage, iterations=2) for stage in choices.stages)
+    log = Trajectory(seen.astype(np.float32), actions, -ends, ends)
+    agent = Agent(replace(choices, stages=stages)).fit(log)
+    agent.executor(0).act(log.observations[0])
+    return agent.num_nodes
 
 
 if __name__ == "__main__":

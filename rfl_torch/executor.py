@@ -282,9 +282,11 @@ class BeliefExecutor:
         self._recognize(self._agent.normalize(observation))
 
     def _cheapest_neighbor(self, node: int) -> int:
-        """The neighbour over which the goal is cheapest."""
+        """The neighbour over which the goal is cheapest; a node without any is its own."""
         row = slice(self._cost.indptr[node], self._cost.indptr[node + 1])
         neighbor = self._cost.indices[row]
+        if not len(neighbor):
+            return node
         return int(neighbor[(self._cost.data[row] + self._cost_to_go[neighbor]).argmin()])
 
     def _choose_next(self) -> None:
@@ -320,6 +322,8 @@ class BeliefExecutor:
     def _scale_edge(self, factor: float) -> None:
         """Multiply the cost of the pursued edge, between the map's own and BLAME_LIMIT times it."""
         row = slice(self._cost.indptr[self._from], self._cost.indptr[self._from + 1])
+        if row.start == row.stop:
+            return
         edge = row.start + int((self._cost.indices[row] == self._next).argmax())
         base = self._agent.map_cost[edge]
         cost = np.clip(self._cost.data[edge] * factor, base, BLAME_LIMIT * base)

@@ -14,6 +14,10 @@ Metric = Literal["euclidean", "chebyshev"]
 Boundary = Literal["open", "torus"]
 
 
+MOST_BYTES = 4_000_000_000
+"""Memory that laying out a grid may take; 10,000 nodes with radius 2 take 6 MB."""
+
+
 class Grid(NamedTuple):
     """The edges of a lattice, nodes numbered in row-major order.
 
@@ -53,6 +57,13 @@ def build_grid(
         raise ValueError(
             f"metric is {metric!r} and boundary {boundary!r}; needs 'euclidean' or 'chebyshev', "
             "and 'open' or 'torus'."
+        )
+    reach = (2 * math.floor(radius) + 1) ** len(shape)
+    needed = 8 * math.prod(shape) * reach * (len(shape) + 1)
+    if needed > MOST_BYTES:
+        raise ValueError(
+            f"a grid of shape {shape} with radius {radius:g} takes {needed / 1e9:.3g} GB to lay "
+            f"out, needs at most {MOST_BYTES / 1e9:.3g}; try fewer nodes or a smaller radius."
         )
     steps = _steps_within(radius, metric, len(shape))
     coordinates = np.indices(shape).reshape(len(shape), -1).T  # (N, dim)

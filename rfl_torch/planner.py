@@ -14,6 +14,9 @@ from scipy.spatial import cKDTree
 ALIKE = 1.0
 """Nats of separation under which two nodes look alike."""
 
+MOST_PAIRS = 100_000_000
+"""Pairs of nodes that may look alike: 16 bytes each."""
+
 PAIRS_AT_ONCE = 100_000
 """Pairs of nodes compared in one go: their readings take tens of megabytes."""
 
@@ -54,7 +57,14 @@ def look_alikes(mean: NDArray[np.float64], scale: NDArray[np.float64], power: fl
     # No scale is above its reading's widest: pairs outside of this ball are told apart for sure.
     widest = np.sqrt(2.0) * scale.max(0)
     radius = np.sqrt(ALIKE / (0.5 * power)) * (1 + 1e-9)
-    pairs = cKDTree(mean / widest).query_pairs(radius, output_type="ndarray")
+    tree = cKDTree(mean / widest)
+    count = int(tree.count_neighbors(tree, radius))
+    if count > MOST_PAIRS:
+        raise ValueError(
+            f"{count} pairs of the {len(mean)} nodes look alike, needs at most {MOST_PAIRS}; the "
+            "readings tell almost no places apart: try other ones, or fewer nodes."
+        )
+    pairs = tree.query_pairs(radius, output_type="ndarray")
     is_alike = np.zeros(len(pairs), bool)
     for start in range(0, len(pairs), PAIRS_AT_ONCE):
         i, j = pairs[start : start + PAIRS_AT_ONCE].T

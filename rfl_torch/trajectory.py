@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 FILE_FORMAT = "rfl_torch/trajectory/1"
 
 ARRAYS = ("observations", "actions", "action_low", "action_high", "ground_truth")
+MOST_BYTES = 8 << 30
+"""Largest log that is unpacked: a file of a few MB can claim any size."""
+
 EPISODES = "episode_steps"
 """int (K,), in a file of K logs one after the other: the actions of each."""
 
@@ -136,9 +139,15 @@ def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """
     try:
         # Opened here: numpy leaves a damaged file open.
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            return {name: file[name] for name in (*ARRAYS, EPISODES) if name in file}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        with open(path, "rb") as raw:
+            with zipfile.ZipFile(raw) as packed:
+                size = sum(member.file_size for member in packed.infolist())
+            if size > MOST_BYTES:
+                raise ValueError(f"{size} bytes when unpacked, at most {MOST_BYTES} are read")
+            raw.seek(0)
+            with np.load(raw, allow_pickle=False) as file:
+                return {name: file[name] for name in (*ARRAYS, EPISODES) if name in file}
+    except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
         if isinstance(error, FileNotFoundError):
             raise
         raise ValueError(

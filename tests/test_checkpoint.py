@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from experiments import trust
-from rfl_torch import Agent
+from rfl_torch import Agent, Trajectory
 from rfl_torch.checkpoint import check_layout, load_checkpoint, save_checkpoint
 
 
@@ -94,3 +94,12 @@ def test_layouts_name_the_tensor_that_does_not_fit():
     state["b"][1] = torch.nan
     with pytest.raises(ValueError, match="b has a number"):
         check_layout(state, layout)
+
+
+def test_a_log_that_unpacks_to_more_than_is_taken_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "log.npz"
+    np.savez_compressed(path, observations=np.zeros((1000, 50)), actions=np.zeros((999, 1)))
+    assert path.stat().st_size < 10_000
+    monkeypatch.setattr("rfl_torch.trajectory.MOST_BYTES", 100_000)
+    with pytest.raises(ValueError, match=r"log\.npz"):
+        Trajectory.load(path)
