@@ -48,7 +48,8 @@ LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
 
 APPROACH = 20
-"""Steps from a goal's node to the goal's own sight; then the node is as near as it gets."""
+"""Steps from a goal's node to the goal's own sight, to within a full action of it; then a sight
+within a look's radius has to do."""
 
 KICK = 20
 """Innate actions after an aborted or a null plan, or the next plan fails where this one did. Three
@@ -188,11 +189,16 @@ class BeliefExecutor:
         is_lost = self._unfamiliar >= LOST
         is_there = self.belief[self._goals].sum() > 0.5 and self.is_familiar
         if self.status == "running" and is_there:
-            if self._approach_left == 0 or self._is_in_sight(normal):
+            if self._sight is None or self._sight_away(normal) <= 1 / LOOK_STEPS:
                 self.status = "reached"
-            else:
+            elif self._approach_left > 0:
                 self._approach_left -= 1
                 return self._agent.control(normal, self.node, self._sight)
+            elif self._sight_away(normal) <= 1.0:
+                self.status = "reached"
+            else:
+                self.status = "gave_up"
+                self.reason = "the place most like the goal does not look like it from near"
         if is_lost and self.status == "running":
             self.recovering = True
             self._next = -1
@@ -210,11 +216,10 @@ class BeliefExecutor:
             return self._search.act(normal)
         return self._agent.control(normal, self._next)
 
-    def _is_in_sight(self, normal: NDArray[np.float64]) -> bool:
-        """Whether the robot sees what it was told to look for, to within a full step."""
+    def _sight_away(self, normal: NDArray[np.float64]) -> float:
+        """How far what the robot sees is from what it was told to look for, in radii of a look."""
         assert self._sight is not None
-        away = np.nanmean(np.abs(normal - self._sight))
-        return bool(away <= self._agent.look_radius / LOOK_STEPS)
+        return float(np.nanmean(np.abs(normal - self._sight)) / self._agent.look_radius)
 
     def _recognize(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter: push the belief over the edges, allow a teleport, weigh by the emission.
