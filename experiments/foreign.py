@@ -90,7 +90,7 @@ class Config:
     """Steps that a random action is held for."""
     peer_steps: tuple[int, ...] = (20_000, 100_000)
     """Environment steps of the pendulum's peer; it needs the extra `foreign`."""
-    peer_seeds: int = 2
+    peer_seeds: int = 1
     """Policies of the peer, each tried once, since its tries would all be the same."""
 
 
@@ -149,10 +149,10 @@ class Row:
 
 def main(config: Config) -> None:
     """Record, learn and try, seed by seed; print the shares over all."""
-    for name in ("seeds", "num_steps", "tries", "hold"):
+    for name in ("seeds", "num_steps", "tries", "hold", "peer_seeds"):
         cli.check_count(f"--{name.replace('_', '-')}", getattr(config, name))
-    for number in (config.peer_seeds, *config.peer_steps):
-        cli.check_count("--peer-seeds or --peer-steps", number)
+    for steps in config.peer_steps:
+        cli.check_count("--peer-steps", steps)
     world = WORLDS[config.world]
     own = Row("this, no reward", f"{config.num_steps}")
     with WithoutVelocity(gym.make(world.env_id, max_episode_steps=-1), world.shown) as env:
