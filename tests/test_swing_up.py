@@ -42,7 +42,60 @@ def test_the_command_learns_tries_and_prints_shares(monkeypatch, capsys):
 
     smooth = AgentConfig.smooth
     monkeypatch.setattr(AgentConfig, "smooth", tiny)
-    foreign.main(foreign.Config("pendulum", num_steps=600, tries=2))
+    foreign.main(foreign.Config("pendulum", num_steps=600, tries=2, peer_steps=()))
     out = capsys.readouterr().out
     assert "Pendulum-v1 without velocity, 600 random steps, 1 logs" in out
     assert "/2 " in out
+
+
+def pump(observation, memory):
+    """Push where it swings to, which only the reading before tells."""
+    angle = np.arctan2(observation[1], observation[0])
+    swing = 0.0 if memory is None else (angle - memory + np.pi) % (2 * np.pi) - np.pi
+    return np.array([2.0 if swing >= 0 else -2.0], np.float32), angle
+
+
+@pytest.mark.parametrize(
+    ("predict", "line"),
+    [
+        (pump, ["1/1", "0/1"]),
+        (lambda observation, memory: (np.zeros(1, np.float32), memory), ["0/1", "0/1"]),
+    ],
+    ids=["pumps", "hangs"],
+)
+def test_a_peer_remembers_and_has_arrived_once_it_is_there(predict, line):
+    world = foreign.WORLDS["pendulum"]
+    row = foreign.Row("peer", "0")
+    with foreign.WithoutVelocity(gym.make(world.env_id, max_episode_steps=-1), world.shown) as env:
+        row.run(
+            env,
+            "pendulum",
+            1,
+            lambda seed: foreign.PeerExecutor(predict, env, "pendulum", seed),
+            "",
+        )
+    arrived, held = (cell.split()[0] for cell in (row.cells()[2], row.cells()[4]))
+    assert [arrived, held] == line
+
+
+def test_the_peer_sees_no_velocity_but_the_reward():
+    with foreign._with_reward(foreign.WORLDS["pendulum"]) as env:
+        observation, _ = env.reset(seed=0)
+        assert observation.shape == env.observation_space.shape == (2,)
+        results = [env.step(np.zeros(1, np.float32)) for _ in range(200)]
+    assert all(reward < 0 for _, reward, *_ in results)
+    assert [truncated for *_, truncated, _ in results] == [False] * 199 + [True]
+
+
+def test_the_peer_learns_and_is_given_at_each_number_of_steps():
+    pytest.importorskip("sb3_contrib", reason="the extra `foreign` is not installed")
+    world = dataclasses.replace(
+        foreign.WORLDS["pendulum"], peer=foreign.PENDULUM_PEER | {"n_steps": 16}
+    )
+    given = []
+    for steps, predict in foreign._train_peer(world, [50, 64, 100], seed=0):
+        action, memory = predict(np.array([-1.0, 0.0], np.float32), None)
+        assert action.shape == (1,)
+        assert memory is not None
+        given.append(steps)
+    assert given == [64, 64, 128]
