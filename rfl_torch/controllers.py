@@ -253,7 +253,9 @@ class RBFBank(nn.Module):
         penalty = torch.ones(features.shape[-1])
         penalty[num_centers:] = 0.1
         gram = features.mT @ features + ridge * torch.diag(penalty)
-        self.weight.copy_(torch.linalg.solve(gram, features.mT @ residual))
+        # By Cholesky: batched LU of matrices this large fails in some builds on several threads.
+        factor = torch.linalg.cholesky(gram.double())
+        self.weight.copy_(torch.cholesky_solve((features.mT @ residual).double(), factor))
         self.bias.copy_(bias)
         error = (features @ self.weight + bias[:, None] - data.targets) * mask
         return float(error.square().sum() / (count.sum() * targets.shape[1]))

@@ -136,6 +136,7 @@ def test_execute_goes_to_one_goal(model, capsys):
                 "figure_7_map_default.png",
                 "figure_8_attractors.png",
                 "figure_9_execution.png",
+                "calibration.png",
                 "execution.gif",
             },
         ),
