@@ -228,9 +228,9 @@ def draw_success_curve(
     """Draw lines with bands; each curve is x, mean, low, high, all (P,)."""
     figure = Figure(figsize=(WIDTH, 4.0), layout="constrained")
     axes = figure.add_subplot(xlabel=xlabel, ylabel=ylabel)
-    colours, markers = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY, INK), "osD^vPX"
+    colours, markers = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY, INK), "osD^vPX*"
     for index, (label, (x, mean, low, high)) in enumerate(curves.items()):
-        colour, marker = colours[index % 7], markers[index % 7]
+        colour, marker = colours[index % 7], markers[index % 8]  # no two pairs alike
         axes.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
         axes.plot(
             x,
@@ -532,6 +532,12 @@ def _pieces(points: Array, period: float | None) -> list[Array]:
     return np.split(points, np.flatnonzero(np.abs(np.diff(points[:, 0])) > period / 2) + 1)
 
 
+def _columns(labels: list[str], inches: float) -> int:
+    """Columns of a legend that is no wider than its figure."""
+    widest = 0.6 + 0.075 * max(map(len, labels))  # a handle, and a letter of 9 points each
+    return max(1, min(5, len(labels), int(inches / widest)))
+
+
 def _finish(figure: Figure, path: Path) -> None:
     """Put the legend below the axes and write the file."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -540,7 +546,7 @@ def _finish(figure: Figure, path: Path) -> None:
             handles,
             labels,
             loc="outside lower center",
-            ncols=min(5, len(handles)),
+            ncols=_columns(labels, figure.get_figwidth()),
             frameon=False,
             fontsize=9,
         )

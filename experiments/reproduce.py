@@ -402,7 +402,7 @@ def draw_maze(out: Path, env: gym.Env, log: Trajectory, runs: dict[str, Run]) ->
     execute.animate(out / "execution.gif", env, run.agent, trial, run.table)
 
 
-FRESH_LOG = (2000, 3, 1_000_000)
+FRESH_LOG = (2000, 1, 1_000_000)
 """Steps, hold and seed of the log that forecasts are compared with."""
 
 
