@@ -8,6 +8,7 @@ from a fitted agent and leave it unchanged.
 import math
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -108,7 +109,7 @@ class Agent:
     """Normalised observation (D,) and belief (N,) of the last control step."""
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
-    memory: Memory | None = None
+    memory: Memory | None
     """What motion is learned from, where the world isn't reversible and `config.steers`."""
     least_familiar: float
     """Tempered log-density [nat] under its node that an observation of a known place has."""
@@ -116,9 +117,12 @@ class Agent:
     def __init__(self, config: AgentConfig | None = None, seed: int = 0) -> None:
         self.config = AgentConfig() if config is None else config
         self.seed = seed
+        self._forget()
+
+    def _forget(self) -> None:
+        """Know nothing yet."""
         self.record: list[learning.Progress] = []
-        self.counts = self.statistics = None
-        self.last_seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self.counts = self.statistics = self.memory = self.last_seen = None
         self._motion: Motion | None = None
 
     # -- learning ---------------------------------------------------------------------------
@@ -146,6 +150,7 @@ class Agent:
                 changes.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
+        self._forget()
         self._set_spaces(logs)
         observations = [torch.from_numpy(self.normalize(log.observations)) for log in logs]
         config = self.config
@@ -378,6 +383,8 @@ class Agent:
             nodes = [path.numpy() for path in self._recognize_logs(observations)]
             if repair.number_anew(nodes)[1] == self.num_nodes:
                 break  # else leave out what the most likely paths leave out
+        assert self.counts is not None
+        self.counts = replace(self.counts, edges=repair.sum_edges(nodes, self.num_nodes))
         return [torch.from_numpy(path) for path in nodes]
 
     def _count(

@@ -143,3 +143,25 @@ def test_every_node_of_a_repaired_map_is_on_its_logs_path_and_outlives_saving(tm
     agent.save(tmp_path / "agent.safetensors")
     again = Agent.load(tmp_path / "agent.safetensors")
     assert (again.recognize(log.observations) == agent.recognize(log.observations)).all()
+
+
+def test_an_agent_learns_more_as_one_that_was_saved_and_loaded_before(tmp_path):
+    kept = Agent(dot_config(shape=(8, 8))).fit(dot_log(2500, seed=3))
+    kept.save(tmp_path / "agent.safetensors")
+    loaded, more = Agent.load(tmp_path / "agent.safetensors"), dot_log(400, seed=6)
+    kept.partial_fit(more)
+    loaded.partial_fit(more)
+    assert (kept.edges != loaded.edges).nnz == 0
+    for name, value in kept.hmm.state_dict().items():
+        assert (value == loaded.hmm.state_dict()[name]).all(), name
+
+
+def test_fitting_again_forgets_what_was_learned_before():
+    agent = Agent(dot_config()).fit(half_log())
+    agent.executor(0).act(half_log().observations[0])
+    again = agent.fit(dot_log(1500, seed=5))
+    fresh = Agent(dot_config()).fit(dot_log(1500, seed=5))
+    assert again.last_seen is None
+    assert (again.statistics is None) == (fresh.statistics is None)
+    for name, value in fresh.hmm.state_dict().items():
+        assert (value == again.hmm.state_dict()[name]).all(), name
