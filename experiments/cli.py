@@ -43,7 +43,7 @@ def make_env(
     observation_keys: Sequence[str] = (),
     **more: Any,
 ) -> gym.Env:
-    """Make the environment `env_id`.
+    """Make the environment `env_id`, without a limit on its steps.
 
     Args:
         env_id: a registered id; `module:id` imports the module that registers it.
@@ -67,7 +67,7 @@ def make_env(
         arguments["layout"] = layout
     _import_sims()
     try:
-        env = gym.make(env_id, disable_env_checker=True, **more, **arguments)
+        env = gym.make(env_id, disable_env_checker=True, max_episode_steps=-1, **more, **arguments)
     except (TypeError, ModuleNotFoundError, gym.error.Error) as error:
         raise ValueError(f"environment {env_id!r} can't be made: {error}") from None
     return _joined(env, observation_keys) if observation_keys else env

@@ -234,15 +234,8 @@ def film(path: Path, env: gym.Env, agent: Agent, trial: Trial, limit: int) -> No
 
 
 def _make_env(config: Config, **more: Any) -> gym.Env:
-    env = cli.make_env(
-        config.env,
-        config.layout,
-        config.env_kwargs,
-        config.observation_keys,
-        max_episode_steps=-1,
-        **more,
-    )
-    return cli.with_action_rows(env)
+    arguments = (config.env, config.layout, config.env_kwargs, config.observation_keys)
+    return cli.with_action_rows(cli.make_env(*arguments, **more))
 
 
 def _tasks(

@@ -165,7 +165,7 @@ def make_faulty(fault: Fault, seed: int) -> Faulty:
             json.dumps({"size": plan.size, "walls": walls.tolist(), "start": plan.start})
         )
         kwargs = json.dumps(fault.options)
-        env = cli.make_env("rfl/RangefinderMaze-v0", str(path), kwargs, max_episode_steps=-1)
+        env = cli.make_env("rfl/RangefinderMaze-v0", str(path), kwargs)
     return Faulty(env, fault, seed)
 
 

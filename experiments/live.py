@@ -126,10 +126,10 @@ def main(config: Config) -> None:
 def _make_env(config: Config) -> Any:
     """The environment, drawing itself if it can and its map has no true places."""
     arguments = (config.env, config.layout, config.env_kwargs, config.observation_keys)
-    env = cli.make_env(*arguments, max_episode_steps=-1)
+    env = cli.make_env(*arguments)
     if scoring.world_of(env) is None and "rgb_array" in env.metadata.get("render_modes", ()):
         try:
-            drawing = cli.make_env(*arguments, max_episode_steps=-1, render_mode="rgb_array")
+            drawing = cli.make_env(*arguments, render_mode="rgb_array")
             drawing.reset()
             drawing.render()
         except Exception as error:  # any failure of a renderer leaves the page without a picture

@@ -68,14 +68,9 @@ def main(config: Config) -> None:
     cli.check_writable(config.out)
     cli.check_count("--num-steps", config.num_steps)
     with contextlib.ExitStack() as stack:
-        made = cli.make_env(
-            config.env,
-            config.layout,
-            config.env_kwargs,
-            config.observation_keys,
-            max_episode_steps=-1,
-        )
-        env = Continued(stack.enter_context(cli.with_action_rows(made)), config.seed)
+        arguments = (config.env, config.layout, config.env_kwargs, config.observation_keys)
+        made = cli.with_action_rows(cli.make_env(*arguments))
+        env = Continued(stack.enter_context(made), config.seed)
         agent = Agent.load(config.model)
         check_fit(agent, env)
         before = agent.num_nodes

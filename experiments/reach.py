@@ -10,6 +10,7 @@ goal at any time, since it has no word for "reached". Its episodes begin anywher
 no robot with a log can have.
 """
 
+import copy
 import importlib.util
 import json
 import time
@@ -27,7 +28,8 @@ from tqdm import tqdm
 import sims
 from experiments import cli, figures, scoring
 from experiments.scoring import MAZE, PLACE_TOLERANCE, Share, Task, wilson
-from rfl_torch import Agent, AgentConfig, Trajectory, record
+from rfl_torch import Agent, AgentConfig, InnateController, Trajectory, record
+from rfl_torch.innate import action_bounds
 from rfl_torch.practice import Strategy
 
 PEER_HORIZON = 100
@@ -134,7 +136,7 @@ def _practise(
     seed: int,
 ) -> Iterator[Row]:
     """Practise by one strategy, and be scored four times on the way."""
-    agent, logs, seconds = _copy(start, config.out), [log], 0.0
+    agent, logs, seconds = copy.deepcopy(start), [log], 0.0
     watched = Watched(env)
     for part in range(4):
         begin = time.perf_counter()
@@ -142,15 +144,6 @@ def _practise(
         seconds += time.perf_counter() - begin
         logs.append(watched.take(log))
         yield judge.score(f"practice: {strategy}", agent, logs, seconds)
-
-
-def _copy(agent: Agent, folder: Path) -> Agent:
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / ".copy.safetensors"
-    agent.save(path)
-    copy = Agent.load(path)
-    path.unlink()
-    return copy
 
 
 class Watched(gym.Wrapper):
@@ -234,16 +227,8 @@ class Judge:
 
     def random_walk(self) -> Row:
         """Held random actions."""
-        innate = np.random.default_rng(self._seed)
-        held: dict[str, Any] = {"left": 0}
-
-        def act(observation: Any, goal: Any) -> Any:
-            if held["left"] == 0:
-                held.update(left=10, action=innate.uniform(-1, 1, 2).astype(np.float32))
-            held["left"] -= 1
-            return held["action"]
-
-        return self.peer("random walk (near at any time)", 0, 0.0, act)
+        innate = InnateController(*action_bounds(self._env.action_space), 10, seed=self._seed)
+        return self.peer("random walk (near at any time)", 0, 0.0, lambda *_: innate.act())
 
     def _comes_near(self, task: Task, act: Callable[..., Any]) -> bool:
         assert task.start is not None

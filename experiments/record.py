@@ -45,13 +45,8 @@ class Config:
 def main(config: Config) -> None:
     """Record one run, or several where the environment ends its episodes."""
     cli.check_writable(config.out)
-    with cli.make_env(
-        config.env,
-        config.layout,
-        config.env_kwargs,
-        config.observation_keys,
-        max_episode_steps=-1,
-    ) as env:
+    arguments = (config.env, config.layout, config.env_kwargs, config.observation_keys)
+    with cli.make_env(*arguments) as env:
         logs = record_episodes(
             env,
             config.num_steps,

@@ -459,7 +459,7 @@ def try_faults(config: Faults) -> bool:
     pooled: dict[str, list[faults.Tally]] = {name: [] for name in faults.FAULTS}
     with tempfile.TemporaryDirectory() as name:
         for seed in range(config.seed, config.seed + config.seeds):
-            env = cli.make_env("rfl/RangefinderMaze-v0", "paper", max_episode_steps=-1)
+            env = cli.make_env("rfl/RangefinderMaze-v0", "paper")
             log = rfl_torch.record(env, config.num_steps, hold=3, seed=seed)
             env.close()
             path = Path(name) / f"{seed}.safetensors"
@@ -518,7 +518,7 @@ def try_soak(config: Soak) -> bool:
     agent = small_agent(config.seed)
     soaks = {"execution": soak_execution(Room(), agent, config.num_steps, config.seed)}
     if config.maze_steps:
-        env = cli.make_env("rfl/RangefinderMaze-v0", "paper", max_episode_steps=-1)
+        env = cli.make_env("rfl/RangefinderMaze-v0", "paper")
         log = rfl_torch.record(env, 5_000, hold=3, seed=config.seed)
         learned = train.fit(AgentConfig(), [log], config.seed)
         soaks["in the maze"] = soak_execution(env, learned, config.maze_steps, config.seed)

@@ -94,7 +94,7 @@ def test_an_environment_films_itself(tmp_path):
 
 
 def test_a_task_goes_on_when_the_cart_pole_falls():
-    with cli.with_action_rows(cli.make_env("CartPole-v1", max_episode_steps=-1)) as env:
+    with cli.with_action_rows(cli.make_env("CartPole-v1")) as env:
         executor = Wandering()
         observation, info = env.reset(seed=0)
         outcome = scoring.run_task(env, executor, observation, info, limit=60)
