@@ -645,12 +645,8 @@ class Agent:
         mean = self._mean[node]
         observation = np.where(np.isnan(normal), mean, normal)
         target = mean if target is None else np.where(np.isnan(target), mean, target)
-        inputs = torch.from_numpy(
-            np.concatenate([observation, target], dtype=np.float32, casting="same_kind")[None]
-        )
-        with torch.inference_mode():
-            unit = self.bank(inputs, torch.tensor([node]))[0].numpy()
-        return self._raw_action(unit)
+        row = np.concatenate([observation, target], dtype=np.float32, casting="same_kind")
+        return self._raw_action(self.bank.at(row, node))
 
     def _raw_action(self, unit: NDArray[np.float32]) -> NDArray[np.float32]:
         """From [0, 1] to the action space; what lies outside is shortened, not bent.

@@ -4,13 +4,16 @@
     u_t = f_j(o_t, mu_j)         the same function asked to reach the node's mean
 
 A bank maps rows (o, o') of width 2 D to actions in [0, 1], 0.5 being the middle of the action
-space. Banks share a signature, not a parent: `forward(inputs, node)` and
+space. Banks share a signature, not a parent: `forward(inputs, node)`, `at(row, node)`, which is
+the same for one row without PyTorch's overhead, half of a control step, and
 `fit(inputs, targets, node)`; `SVRBank` in `online_svr` is the third.
 """
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 LEAST_SAMPLES = 8
@@ -145,6 +148,11 @@ def group_by_node(inputs: Tensor, targets: Tensor, node: Tensor, num_nodes: int)
     return Padded(padded_inputs, padded_targets, mask)
 
 
+def _array(parameter: Tensor, node: int) -> NDArray[np.float32]:
+    """One node's part of a bank's parameter, not copied."""
+    return parameter.detach().numpy()[node]
+
+
 class MLPBank(nn.Module):
     """N two-layer perceptrons with a linear path from (o' - o), one for each node.
 
@@ -172,6 +180,14 @@ class MLPBank(nn.Module):
         linear = torch.einsum("bd,bda->ba", difference, self.linear_weight[node])
         action = torch.einsum("bh,bha->ba", hidden, self.action_weight[node])
         return action + linear + self.action_bias[node]
+
+    def at(self, row: NDArray[np.float32], node: int) -> NDArray[np.float32]:
+        """Action (A,) that a node asks for at a row (o, o') (2 D,)."""
+        hidden = row @ _array(self.hidden_weight, node) + _array(self.hidden_bias, node)
+        action = np.tanh(hidden) @ _array(self.action_weight, node)
+        difference = row[self.obs_dim :] - row[: self.obs_dim]
+        linear = difference @ _array(self.linear_weight, node)
+        return action + linear + _array(self.action_bias, node)
 
     def fit(
         self,
@@ -232,6 +248,15 @@ class RBFBank(nn.Module):
         """Actions (B, A) that the nodes (B,) ask for at rows (o, o') (B, 2 D)."""
         features = self._features(inputs[:, None], self.center[node], self.bandwidth[node])
         return (features @ self.weight[node])[:, 0] + self.bias[node]
+
+    def at(self, row: NDArray[np.float32], node: int) -> NDArray[np.float32]:
+        """Action (A,) that a node asks for at a row (o, o') (2 D,)."""
+        away = row - _array(self.center, node)
+        bandwidth, weight = _array(self.bandwidth, node), _array(self.weight, node)
+        bumps = np.exp(-0.5 * np.einsum("ci,ci->c", away, away) / bandwidth**2)
+        difference = row[self.obs_dim :] - row[: self.obs_dim]
+        linear = difference @ weight[len(bumps) :]
+        return bumps @ weight[: len(bumps)] + linear + _array(self.bias, node)
 
     @torch.no_grad()
     def fit(self, inputs: Tensor, targets: Tensor, node: Tensor, ridge: float = 0.1) -> float:

@@ -603,6 +603,13 @@ class SVRBank(nn.Module):
         pieces = zip(x.split(rows), node.split(rows), strict=True)
         return torch.cat([self._evaluate(x, node) for x, node in pieces]).to(inputs.dtype)
 
+    def at(self, row: NDArray[np.float32], node: int) -> NDArray[np.float32]:
+        """Return what one node predicts at one row (input_dim,), (action_dim,)."""
+        away = row - self.support_input[node].numpy()
+        kernel = np.exp(np.einsum("mi,mi->m", away, away) / (-2 * self.bandwidth**2))
+        action = kernel @ self.dual_coef[node].numpy() + self.bias[node].numpy()
+        return action.astype(np.float32)
+
     def fit(self, inputs: Tensor, targets: Tensor, node: Tensor) -> float:
         """Forget everything, then learn as `partial_fit` does."""
         self.reset()
