@@ -5,7 +5,6 @@ recognise the log (2.3), give its triplets to the nodes' controllers (2.4). Exec
 from a fitted agent and leave it unchanged.
 """
 
-import math
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -19,13 +18,8 @@ from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from rfl_torch import growth, inference, learning, repair
-from rfl_torch.checkpoint import (
-    Layout,
-    check_index,
-    check_layout,
-    load_checkpoint,
-    save_checkpoint,
-)
+from rfl_torch.agent_layout import check_state
+from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
 from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
 from rfl_torch.config import AgentConfig
 from rfl_torch.controllers import (
@@ -39,14 +33,14 @@ from rfl_torch.controllers import (
     latest,
     pool_sparse_nodes,
 )
-from rfl_torch.executor import BLAME_LIMIT, Executor, make_executor
-from rfl_torch.hmm import MAX_READING, GridHMM, Statistics
-from rfl_torch.innate import directions
+from rfl_torch.executor import Executor, make_executor
+from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.motion import Memory, Motion, remember, remember_more
 from rfl_torch.online_svr import SVRBank
 from rfl_torch.planner import look_alikes, seen_edges
 from rfl_torch.practice import Attempt, PracticeMonitor, Strategy, practice
 from rfl_torch.resume import SavedLearning, identity
+from rfl_torch.senses import apart
 from rfl_torch.trajectory import Trajectory
 
 Goal = int | NDArray[np.float32] | Callable[[int], bool]
@@ -69,13 +63,6 @@ MOST_SAMPLES = 256
 
 MOST_ROUNDS = 8
 """Times that a repaired map is counted and its logs recognised anew, until all nodes are used."""
-
-MOST_ACTIONS = 1024
-"""Numbers in an action at most, of an agent from a file."""
-
-MOST_CELLS, MOST_CELLS_A_NODE = 10_000, 100
-"""A file's lattice may have so many cells, or so many for each node that is left: all take memory,
-whether a node is left in them or not."""
 
 MIN_STEPS = 10
 """Shortest log that is accepted: the coarsest stage still needs a few steps."""
@@ -169,15 +156,17 @@ class Agent:
             self.record = learning.learn(self.hmm, observations, stages, saved, record)
         learning.prune(self.hmm, observations, power)
         paths = self._recognize_logs(observations)
-        self.look_radius = repair.look_radius(
-            self._filled(observations, paths), [self._unit_actions(log.actions) for log in logs]
-        )
-        self._learn_controllers(logs, observations, paths, monitor)
+        actions = [self._unit_actions(log.actions) for log in logs]
+        self.look_radius = repair.look_radius(self._filled(observations, paths), actions)
+        loss = self._learn_controllers(observations, actions, paths)
         if config.repairs and self.is_reversible:
             paths = self._repair(observations, paths)
-            self._learn_controllers(logs, observations, paths, monitor)
+            loss = self._learn_controllers(observations, actions, paths)
         else:
             self.statistics = self.hmm.e_step(observations, power)
+        if monitor is not None:
+            monitor.scalar("controllers/loss", loss, len(self.record))
+        self._prepare_planning()
         return self
 
     def learn_from_labels(self, logs: list[Trajectory], nodes: list[NDArray[np.int64]]) -> "Agent":
@@ -188,9 +177,11 @@ class Agent:
             nodes: of every observation of each log, int64 (T+1,).
         """
         observations = [self.normalize(log.observations) for log in logs]
+        actions = [self._unit_actions(log.actions) for log in logs]
         paths = [torch.from_numpy(path) for path in self._count(nodes, observations)]
         self._prepare_recognition()
-        self._learn_controllers(logs, [torch.from_numpy(x) for x in observations], paths, None)
+        self._learn_controllers([torch.from_numpy(x) for x in observations], actions, paths)
+        self._prepare_planning()
         return self
 
     def partial_fit(self, logs: Trajectory | list[Trajectory]) -> "Agent":
@@ -406,47 +397,40 @@ class Agent:
 
     def _learn_controllers(
         self,
-        logs: list[Trajectory],
         observations: list[Tensor],
+        unit_actions: list[NDArray[np.float32]],
         paths: list[Tensor],
-        monitor: AgentMonitor | None,
-    ) -> None:
-        """Count the edges that the logs take, train the bank on their triplets.
+    ) -> float:
+        """Count the edges that the logs take, train the bank on their triplets; returns its loss.
 
         Where the controllers so learned predict the log run backwards, the world is reversible:
         they learn from both directions then, and the planner trusts edges taken one way only.
         """
         nodes = [path.numpy() for path in paths]
         self.edges = repair.sum_edges(nodes, self.num_nodes)
-        unit_actions = [self._unit_actions(log.actions) for log in logs]
         self.tried = repair.count_directions(nodes, unit_actions, self.num_nodes)
-        forward, backward, densities, recognized = [], [], [], []
-        for log, sequence, path in zip(logs, observations, paths, strict=True):
-            densities.append(self._own_log_density(sequence, path))
-            actions = torch.from_numpy(self._unit_actions(log.actions))
-            # A missing reading is taken for the node's own, as `control` does.
-            known = torch.where(sequence.isnan(), self.hmm.emission_mean[path], sequence).detach()
-            samples = (path, known.float(), actions, self.config.horizon)
-            recognized.append(samples[:3])
-            forward.append(assign_triplets(*samples))
-            backward.append(assign_reversed(*samples))
-        triplets = concatenate(forward)
+        logs = list(zip(paths, observations, map(torch.from_numpy, unit_actions), strict=True))
+        own_density = torch.cat([self._own_log_density(seen, path) for path, seen, _ in logs])
+        self.least_familiar = own_density.quantile(UNFAMILIAR_SHARE).item()
+        # A missing reading is taken for the node's own, as `control` does.
+        mean = self.hmm.emission_mean.detach()
+        logs = [
+            (path, torch.where(seen.isnan(), mean[path], seen).float(), actions)
+            for path, seen, actions in logs
+        ]
+        triplets = concatenate([assign_triplets(*log, self.config.horizon) for log in logs])
         loss = self._train_bank(triplets)
-        self.least_familiar = torch.cat(densities).quantile(UNFAMILIAR_SHARE).item()
         self.is_reversible = False
         if self.config.uses_reversal and len(triplets.node):
-            reversed_triplets = concatenate(backward)
-            self.is_reversible = explained(self.bank, reversed_triplets) > REVERSIBLE_SHARE
+            backward = concatenate([assign_reversed(*log, self.config.horizon) for log in logs])
+            self.is_reversible = explained(self.bank, backward) > REVERSIBLE_SHARE
         if self.is_reversible:
-            triplets = concatenate([triplets, reversed_triplets])
+            triplets = concatenate([triplets, backward])
             loss = self._train_bank(triplets)
         self.samples = latest(triplets, MOST_SAMPLES)
-        if monitor is not None:
-            monitor.scalar("controllers/loss", loss, len(self.record))
         is_steered = self.config.steers and not self.is_reversible and len(triplets.node) > 0
-        self.memory = remember(recognized) if is_steered else None
-        self._motion = None
-        self._prepare_planning()
+        self.memory, self._motion = remember(logs) if is_steered else None, None
+        return loss
 
     def _train_bank(self, triplets: Triplets) -> float:
         """Learn a new bank from triplets; where the log never changes node, it stays at rest."""
@@ -495,11 +479,8 @@ class Agent:
         source, target = edges.tocoo().coords
         steps = np.ones(len(source))
         if self.is_reversible:
-            mean = self.hmm.emission_mean.detach().float()
-            inputs = torch.cat([mean[source], mean[target]], 1)
-            with torch.no_grad():
-                unit = self.bank(inputs, torch.from_numpy(target).long())
-            steps = np.maximum(1.0, 2.0 * (unit - 0.5).abs().max(1).values.double().numpy())
+            unit = self.ask(source, target).astype(np.float64)
+            steps = np.maximum(1.0, 2.0 * np.abs(unit - 0.5).max(1))
         return csr_array((steps, (source, target)), shape=edges.shape)
 
     def _look_alikes(self, seen: csr_array) -> csr_array:
@@ -625,15 +606,21 @@ class Agent:
 
         NaN if all its readings are missing.
         """
-        difference = np.abs(normal - self._mean[node])
-        is_there = ~np.isnan(difference)
-        if not is_there.any():
-            return math.nan
-        return float(difference[is_there].mean() / self.look_radius)
+        return apart(normal, self._mean[node]) / self.look_radius
 
     def log_emission(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Tempered log-density of one normalised observation (D,) under every node, (N,)."""
         return inference.log_emission(self.chain, normal[None])[0, self.chain.cell]
+
+    def ask(self, source: NDArray[np.integer], target: NDArray[np.integer]) -> NDArray[np.float32]:
+        """What the controllers of nodes `target` (E,) ask for at the means of `source`, (E, A).
+
+        In [0, 1], not yet shortened to the action space.
+        """
+        mean = self.hmm.emission_mean.detach().float()
+        with torch.no_grad():
+            inputs = torch.cat([mean[source], mean[target]], 1)
+            return self.bank(inputs, torch.from_numpy(target).long()).numpy()
 
     def control(
         self, normal: NDArray[np.float64], node: int, target: NDArray[np.float64] | None = None
@@ -723,7 +710,7 @@ class Agent:
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         config = self.config
-        sizes = self._check_state(state)
+        sizes = check_state(state, config)
         self.hmm = GridHMM.of_state(
             config.shape, config.radius, config.metric, config.boundary, _with_prefix(state, "hmm.")
         )
@@ -752,131 +739,6 @@ class Agent:
         self._prepare_planning()
         pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()
         self._blame_again([(i, j, factor) for (i, j), factor in zip(pairs, factors, strict=True)])
-
-    def _check_state(self, state: dict[str, Tensor]) -> dict[str, int]:
-        """Make sure that a file's tensors fit together; returns the sizes of `LAYOUT`.
-
-        Raises:
-            ValueError: saying which tensor doesn't fit and why.
-        """
-        layout = dict(LAYOUT)
-        if "statistics" in state:
-            layout["statistics"] = (torch.float64, "x")
-        if "counts.weight" in state:
-            layout |= {f"counts.{x}": (torch.float64, "ND") for x in ("weight", "first", "second")}
-        if "memory.node" in state:
-            layout |= MEMORY_LAYOUT
-        layout |= BANK_LAYOUTS[self.config.controller]
-        sizes = check_layout(state, layout)
-        num_nodes, obs_dim, action_dim = (sizes[letter] for letter in "NDA")
-        if min(num_nodes, obs_dim, action_dim) < 1 or action_dim > MOST_ACTIONS:
-            raise ValueError(
-                f"has {num_nodes} nodes, {obs_dim} readings and {action_dim} actions; needs at "
-                f"least one of each and at most {MOST_ACTIONS} actions"
-            )
-        if sizes["I"] != 2 * obs_dim or sizes.get("P", 0) not in (0, sizes.get("C", 0) + obs_dim):
-            raise ValueError(f"the bank's inputs don't fit {obs_dim} readings")
-        for name in ("edges.pair", "blame.pair", "samples.node"):
-            check_index(name, state[name], num_nodes)
-        if "memory.node" in state:
-            check_index("memory.node", state["memory.node"], num_nodes)
-            check_index("memory.start", state["memory.start"], sizes["Q"])
-        if "bank.num_samples" in state:
-            check_index("bank.num_samples", state["bank.num_samples"], sizes["S"] + 1)
-        if sizes["2"] != 2:
-            raise ValueError(f"edges.pair has {sizes['2']} columns, needs 2")
-        if sizes["W"] != len(directions(action_dim)):
-            raise ValueError(f"tried has {sizes['W']} columns, needs one a direction")
-        for name in (
-            "edges.count",
-            "tried",
-            "observation_scale",
-            "observation_period",
-            "counts.weight",
-            "look_radius",
-        ):
-            if name in state and (state[name] < 0).any():
-                raise ValueError(f"{name} has a number below zero")
-        if state["look_radius"] == 0:
-            raise ValueError("look_radius is 0")
-        factor = state["blame.factor"]
-        if ((factor < 0.99) | (factor > 1.01 * BLAME_LIMIT)).any():
-            raise ValueError(f"blame.factor has numbers outside 1 to {BLAME_LIMIT:g}")
-        if state["hmm.emission_log_scale"].abs().max() > 100:
-            raise ValueError("hmm.emission_log_scale has numbers beyond 100")
-        if state["hmm.emission_mean"].abs().max() > MAX_READING:
-            raise ValueError(f"hmm.emission_mean has numbers beyond {MAX_READING:g}")
-        if (state["action_low"] > state["action_high"]).any():
-            raise ValueError("action_low is above action_high")
-        num_used = int((state["observation_scale"] > 0).sum())
-        if num_used + int((state["observation_period"] > 0).sum()) != obs_dim:
-            raise ValueError(f"observation_scale doesn't have {obs_dim} readings in use")
-        cells = math.prod(self.config.shape)
-        if cells > MOST_CELLS and cells > MOST_CELLS_A_NODE * num_nodes:
-            raise ValueError(
-                f"its lattice of {self.config.shape} has {cells} cells for {num_nodes} nodes"
-            )
-        return sizes
-
-
-MEMORY_LAYOUT: Layout = {
-    "memory.observation": (torch.float32, "QD"),
-    "memory.action": (torch.float32, "QA"),
-    "memory.node": (torch.int64, "Q"),
-    "memory.start": (torch.int64, "L"),
-}
-
-LAYOUT: Layout = {
-    "hmm.successor": (torch.int64, "NK"),
-    "hmm.successor_mask": (torch.bool, "NK"),
-    "hmm.cell": (torch.int64, "N"),
-    "hmm.transition_logits": (torch.float64, "NK"),
-    "hmm.initial_logits": (torch.float64, "N"),
-    "hmm.emission_mean": (torch.float64, "ND"),
-    "hmm.emission_log_scale": (torch.float64, "ND"),
-    "edges.pair": (torch.int64, "E2"),
-    "edges.count": (torch.float64, "E"),
-    "blame.pair": (torch.int64, "F2"),
-    "blame.factor": (torch.float64, "F"),
-    "tried": (torch.float64, "NW"),
-    "look_radius": (torch.float64, ""),
-    "least_familiar": (torch.float64, ""),
-    "is_reversible": (torch.bool, ""),
-    "observation_low": (torch.float64, "R"),
-    "observation_scale": (torch.float64, "R"),
-    "observation_period": (torch.float64, "R"),
-    "action_low": (torch.float32, "A"),
-    "action_high": (torch.float32, "A"),
-    "samples.observation": (torch.float32, "MD"),
-    "samples.target": (torch.float32, "MD"),
-    "samples.action": (torch.float32, "MA"),
-    "samples.node": (torch.int64, "M"),
-}
-"""What a file holds of every agent: N nodes, D readings in use of R, A actions."""
-
-BANK_LAYOUTS: dict[str, Layout] = {
-    "rbf": {
-        "bank.center": (torch.float32, "NCI"),
-        "bank.bandwidth": (torch.float32, "N"),
-        "bank.weight": (torch.float32, "NPA"),
-        "bank.bias": (torch.float32, "NA"),
-    },
-    "mlp": {
-        "bank.hidden_weight": (torch.float32, "NIH"),
-        "bank.hidden_bias": (torch.float32, "NH"),
-        "bank.linear_weight": (torch.float32, "NDA"),
-        "bank.action_weight": (torch.float32, "NHA"),
-        "bank.action_bias": (torch.float32, "NA"),
-    },
-    "svr": {
-        "bank.support_input": (torch.float64, "NSI"),
-        "bank.target": (torch.float64, "NSA"),
-        "bank.dual_coef": (torch.float64, "NSA"),
-        "bank.bias": (torch.float64, "NA"),
-        "bank.num_samples": (torch.int64, "N"),
-    },
-}
-"""And of its bank."""
 
 
 def _sparse(pair: Tensor, count: Tensor, num_nodes: int) -> csr_array:

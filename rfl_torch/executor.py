@@ -20,7 +20,7 @@ from rfl_torch.innate import InnateController
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
 from rfl_torch.repair import LOOK_STEPS
 from rfl_torch.search import Search
-from rfl_torch.senses import FEW, believed, sensible
+from rfl_torch.senses import FEW, apart, believed, sensible
 from rfl_torch.steering import SteeringExecutor
 
 if TYPE_CHECKING:
@@ -156,7 +156,6 @@ class BeliefExecutor:
         self._search = Search(*agent.action_bounds, agent.look_radius, seed)
         self.is_familiar = True
         self._unfamiliar = self._weak = 0
-        self._doubts = 0.0
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         self._cost_to_go = cost_to_go(self._cost, goals)
         self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
@@ -219,7 +218,7 @@ class BeliefExecutor:
     def _sight_away(self, normal: NDArray[np.float64]) -> float:
         """How far what the robot sees is from what it was told to look for, in radii of a look."""
         assert self._sight is not None
-        return float(np.nanmean(np.abs(normal - self._sight)) / self._agent.look_radius)
+        return apart(normal, self._sight) / self._agent.look_radius
 
     def _recognize(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter: push the belief over the edges, allow a teleport, weigh by the emission.
@@ -250,16 +249,16 @@ class BeliefExecutor:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Leave out readings that don't fit, and take note of how familiar the rest looks."""
         agent = self._agent
-        self._doubts = 0.0
+        doubted = 0.0
         self.is_familiar = agent.strangeness(normal, int(log_emission.argmax())) <= STRANGE
         if not self.is_familiar:
-            normal, self._doubts = believed(normal, agent._mean, predicted, agent.look_radius)
-            if self._doubts < 1.0:
+            normal, doubted = believed(normal, agent._mean, predicted, agent.look_radius)
+            if doubted < 1.0:
                 log_emission = agent.log_emission(normal)
-                self.is_familiar = self._doubts <= FEW
+                self.is_familiar = doubted <= FEW
         if self.is_familiar:
             self._unfamiliar = self._weak = 0
-        elif self._doubts < 1.0 and self._weak < LONGEST_DOUBT:
+        elif doubted < 1.0 and self._weak < LONGEST_DOUBT:
             self._unfamiliar, self._weak = 0, self._weak + 1
         else:
             self._unfamiliar += 1
@@ -275,9 +274,7 @@ class BeliefExecutor:
         if self._agent.last_seen is None:
             return uniform
         seen, belief = self._agent.last_seen
-        away = np.abs(seen - normal)
-        away = away[~np.isnan(away)]
-        is_same = len(away) and away.mean() <= self._agent.look_radius / LOOK_STEPS
+        is_same = apart(seen, normal) <= self._agent.look_radius / LOOK_STEPS
         if not is_same or len(belief) != len(uniform):
             return uniform
         return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from rfl_torch.innate import directions, nearest_direction
@@ -119,11 +118,7 @@ class Goals:
 def untried(agent: "Agent") -> NDArray[np.bool_]:
     """Actions that were never tried at a node and lead to no neighbour that is known, (N, K)."""
     graph = agent.graph.tocoo()
-    mean = agent.hmm.emission_mean.detach().float()
-    inputs = torch.cat([mean[graph.row], mean[graph.col]], 1)
-    with torch.no_grad():
-        unit = agent.bank(inputs, torch.from_numpy(graph.col).long()).numpy()
-    way, _ = nearest_direction(unit)
+    way, _ = nearest_direction(agent.ask(graph.row, graph.col))
     known = agent.tried > 0
     known[graph.row, way] = True
     return ~known

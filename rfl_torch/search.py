@@ -30,7 +30,7 @@ class Search:
         self._actions = (low + unit * (high - low)).astype(np.float32).clip(low, high)
         self._radius = radius
         self._rng = np.random.default_rng(seed)
-        self._looks: list[NDArray[np.float64]] = []
+        self._looks = np.empty((0, 0))
         self._tried: list[NDArray[np.int64]] = []
         self._look = -1
         self._choice = -1
@@ -50,10 +50,10 @@ class Search:
         return self._actions[self._choice]
 
     def _recognize(self, normal: NDArray[np.float64]) -> int:
-        if self._looks:
-            away = distance(normal[None], np.array(self._looks))[0]
+        if len(self._looks):
+            away = distance(normal[None], self._looks)[0]
             if away.min() <= self._radius:
                 return int(away.argmin())
-        self._looks.append(normal)
+        self._looks = np.append(self._looks.reshape(-1, len(normal)), normal[None], axis=0)
         self._tried.append(np.zeros(len(self._actions), np.int64))
         return len(self._looks) - 1

@@ -5,6 +5,8 @@ with one. Readings that don't fit the place that most of them agree on are taken
 wall was moved, up to half of them don't fit: then only places that the robot may be at are asked.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,13 @@ FARTHEST = 1e6
 def sensible(normal: Array) -> Array:
     """Take infinite and absurd numbers for missing readings."""
     return np.where(np.abs(normal) <= FARTHEST, normal, np.nan)
+
+
+def apart(a: Array, b: Array) -> float:
+    """Mean absolute difference over the readings that both have; NaN if there is none."""
+    difference = np.abs(a - b)
+    is_there = ~np.isnan(difference)
+    return float(difference[is_there].mean()) if is_there.any() else math.nan
 
 
 def believed(normal: Array, mean: Array, predicted: Array, radius: float) -> tuple[Array, float]:
