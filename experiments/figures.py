@@ -214,7 +214,7 @@ def draw_calibration(path: Path, nominal: Array, held: dict[int, Array]) -> None
     )
     axes.plot([0, 1], [0, 1], color=INK, lw=0.8, ls=":")
     for colour, (steps, share) in zip((BLUE, RED, GREEN, PURPLE), held.items(), strict=False):
-        axes.plot(nominal, share, color=colour, label=f"{steps} steps ahead")
+        axes.plot(nominal, share, color=colour, label=f"{steps} step{'s' * (steps > 1)} ahead")
     axes.spines[["top", "right"]].set_visible(False)
     _finish(figure, path)
 
