@@ -24,6 +24,7 @@ from tqdm import tqdm
 from experiments import cli, figures, scoring
 from experiments.scoring import MAZE, NodeTable, Task, Trial, World
 from rfl_torch import Agent
+from rfl_torch.innate import action_bounds
 from rfl_torch.monitor import TensorBoardMonitor
 
 
@@ -276,7 +277,7 @@ def _check(config: Config) -> None:
 
 def check_fit(agent: Agent, env: gym.Env) -> None:
     """Refuse an environment that the agent has not learned from."""
-    shapes = (env.observation_space.shape, env.action_space.shape)
+    shapes = (env.observation_space.shape, action_bounds(env.action_space)[0].shape)
     needed = (agent.observation_low.shape, agent.rest_action.shape)
     if shapes != needed:
         raise ValueError(
