@@ -1,6 +1,7 @@
 """Environments that were not written here: from their id to goals, by the commands alone."""
 
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ import torch
 from gymnasium import spaces
 from PIL import Image
 
-from experiments import cli, execute, record, scoring, train
+from experiments import cli, environments, execute, record, scoring, train
 from rfl_torch import Agent, AgentConfig, Stage, read_logs
 from rfl_torch.innate import check_spaces
 
@@ -199,3 +200,22 @@ class Arrived:
         own = SimpleNamespace(status="reached", goal=goal, node=self._node, path=[], reason="")
         own.act = lambda observation: self._agent.rest_action
         return own
+
+
+def test_one_command_prints_all_environments_against_the_random_walk(monkeypatch, capsys):
+    monkeypatch.setattr(environments, "AgentConfig", lambda: AgentConfig((4, 4), stages=SHORT))
+    few = [world for world in environments.WORLDS if ":" not in world.env_id][1:]
+    monkeypatch.setattr(environments, "WORLDS", few)
+    environments.main(environments.Config(seeds=1, num_steps=400, trials=3, limit=10))
+    out = capsys.readouterr().out
+    for world, kind in zip(few, ("Box", "Discrete"), strict=True):
+        assert re.search(rf"^{world.env_id} +{kind} +\d/3 .* \d/3 ", out, re.M)
+
+
+def test_the_worlds_of_the_table_babble_as_the_docs_say():
+    docs = (Path(__file__).parents[1] / "docs" / "choosing.md").read_text()
+    for world in environments.WORLDS:
+        options = f"--hold {world.hold}"
+        options += f" --levels {world.levels}" if world.levels else ""
+        options += "".join(f" --observation-keys {key}" for key in world.observation_keys)
+        assert f"| `{world.env_id}` | `{options}` |" in docs
