@@ -194,7 +194,8 @@ class Drive:
         if self.path:
             if self._plan and self.path != self._plan[-len(self.path) :]:
                 self.num_plans += 1
-                self._tell(f"re-planned: {len(self.path) - 1} nodes to go")
+                left = len(self.path) - 1
+                self._tell(f"re-planned: {left} node{'s' * (left != 1)} to go")
             self._plan = self.path
         if self.is_lost and not self._was_lost and self.executor.status == "running":
             self._tell("lost")

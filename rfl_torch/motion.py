@@ -60,8 +60,9 @@ STRAY = 3.0
 """Spacings from the landmarks from which on a situation counts as off them."""
 
 SHOWN = 0.5
-"""Share of what changes next that may be left open by observations that show the motion. It is
-0.03 to 0.2 with velocities among the readings, 0.8 of a pendulum's angle."""
+"""Observations show the motion if, with their changes known too, more than this share stays open of
+what they leave open of what comes next. It is 0.85 and more with velocities among the readings, up
+to 0.14 without."""
 
 UNHEEDED = 1e6
 """Spread of changes that makes them count for nothing."""
@@ -171,10 +172,13 @@ class Motion:
         self.choices = choices(action[rows])
         spread = [np.maximum(part.std(0).mean(), 1e-9) for part in (now, now - before)]
         self.scale = self._spread = np.repeat(spread, self.obs_dim)
-        self.is_shown = left_open(memory, rows) < SHOWN
+        situation = np.concatenate([now, now - before], 1) / self.scale
+        ask = (observation[rows + 1] - now, action[rows], rows)
+        blind = left_open(now, *ask)
+        self.is_shown = left_open(situation, *ask) > SHOWN * blind
         if self.is_shown:
             self.scale = np.repeat([spread[0], UNHEEDED], self.obs_dim)
-        situation = np.concatenate([now, now - before], 1) / self.scale
+            situation = np.concatenate([now, now - before], 1) / self.scale
         self._log_tree, self._log_node = cKDTree(situation), memory.node[rows]
         self._learn_from(rows, situation, observation, action)
         landmark = situation[spread_out(situation, NUM_SEEN)]
@@ -337,31 +341,27 @@ def _inner_rows(memory: Memory, ahead: int) -> NDArray[np.int64]:
     return np.asarray(rows[missing[rows + ahead + 1] == missing[rows - 1]])
 
 
-def left_open(memory: Memory, rows: NDArray[np.int64]) -> float:
-    """Share of what changes next that an observation and an action leave open, about 0 to 1.
+def left_open(
+    situation: Array, change: Array, action: NDArray[np.float32], time: NDArray[np.int64]
+) -> float:
+    """How far apart what changes next (M, R) is in situations (M, D) that look most alike.
 
-    The median difference between what changed here and what changed where the log, at another time
-    and with the same action, saw what is most alike; over that between any two times. The mean of
-    the readings that change.
+    Each is compared with the nearest of those of the same action (M, A) and another time (M,), by
+    the mean absolute difference, each reading over its usual change; NaN if there are none.
     """
-    observation = memory.observation.astype(np.float64)
-    now, change = observation[rows], observation[rows + 1] - observation[rows]
-    kind = np.unique(memory.action[rows], axis=0, return_inverse=True)[1].ravel()
-    here, there = [], []
+    kind = np.unique(action, axis=0, return_inverse=True)[1].ravel()
+    parts = []
     for k in range(kind.max() + 1):
         own = np.flatnonzero(kind == k)
-        near = own[cKDTree(now[own]).query(now[own], range(1, min(HORIZON, len(own)) + 1))[1]]
-        is_other = np.abs(rows[near] - rows[own][:, None]) > 2 * HORIZON
-        first = near[np.arange(len(own)), is_other.argmax(1)]
-        here.append(own[is_other.any(1)])
-        there.append(first[is_other.any(1)])
-    alike = np.concatenate(here), np.concatenate(there)
-    any_two = np.arange(len(rows)), np.roll(np.arange(len(rows)), len(rows) // 2)
-    if not len(alike[0]):
-        return 1.0
-    difference, usual = (np.median(np.abs(change[i] - change[j]), 0) for i, j in (alike, any_two))
-    moves = usual > 0
-    return float((difference[moves] / usual[moves]).mean()) if moves.any() else 1.0
+        rank = range(1, min(HORIZON, len(own)) + 1)
+        near = own[cKDTree(situation[own]).query(situation[own], rank)[1]]
+        is_other = np.abs(time[near] - time[own][:, None]) > 2 * HORIZON
+        other = near[np.arange(len(own)), is_other.argmax(1)]
+        parts.append(np.abs(change[own] - change[other])[is_other.any(1)])
+    difference = np.concatenate(parts)
+    if not len(difference):
+        return np.nan
+    return float((difference.mean(0) / np.abs(change).mean(0).clip(1e-12)).mean())
 
 
 def spread_out(points: Array, num: int) -> NDArray[np.int64]:

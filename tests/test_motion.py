@@ -18,6 +18,7 @@ from rfl_torch.motion import (
     apart,
     choices,
     held_steps,
+    left_open,
     remember,
     remember_more,
     spread_out,
@@ -169,6 +170,23 @@ def test_models_reach_as_far_as_half_of_the_actions_are_held(hold):
         left.append(int(np.argmin(same)) if not same.all() else end - row)
     longest = max(k for k in range(1, HORIZON + 1) if np.mean(np.array(left) >= k) >= 0.5)
     assert held_steps(memory) == longest
+
+
+def test_what_alike_situations_leave_open_is_that_of_the_nearest_at_another_time():
+    rng = np.random.default_rng(0)
+    time = np.concatenate([np.arange(200), np.arange(300, 420)])
+    situation, change = rng.random((320, 3)), rng.normal(size=(320, 2))
+    action = rng.integers(2, size=(320, 1)).astype(np.float32)
+    difference = []
+    for i in range(320):
+        away = np.linalg.norm(situation - situation[i], axis=1)
+        away[(action != action[i]).any(1)] = np.inf
+        nearest = np.argsort(away)[:HORIZON]  # it looks no further
+        others = nearest[np.abs(time[nearest] - time[i]) > 2 * HORIZON]
+        difference += [np.abs(change[others[0]] - change[i])] if len(others) else []
+    expected = (np.mean(difference, 0) / np.abs(change).mean(0)).mean()
+    assert left_open(situation, change, action, time) == pytest.approx(expected, rel=1e-12)
+    assert np.isnan(left_open(situation[:20], change[:20], action[:20], time[:20]))
 
 
 def test_motion_is_taken_from_changes_unless_observations_show_it(motion):
