@@ -417,6 +417,7 @@ def _mark(
             "show": True,
             "formatter": label,
             "position": side,
+            "distance": 18 - size // 2,  # beyond the largest mark, which may be around this one
             "fontSize": 13,
             "fontWeight": "bold",
             "color": border if colour == "transparent" else colour,
