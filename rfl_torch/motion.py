@@ -212,7 +212,7 @@ class Motion:
         return np.concatenate([scaled * (self.scale / self._spread), held, one], 1)
 
     def _fit(self, scaled: Array) -> Array:
-        """Local linear models around situations (B, 2 E), (B, I, K E).
+        """Local linear models around situations (B, 2 E), (B, I, H E), of the H steps ahead.
 
         Ridge regressions on the nearest samples, as many of each choice.
         """
