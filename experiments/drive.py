@@ -48,6 +48,9 @@ class Drive:
         self.trail: deque[NDArray[np.float64]] = deque(maxlen=TRAIL)
         self.num_steps = self.num_plans = 0
         self.goal: int | None = None
+        self.path: list[int] = []
+        """The planned nodes, from where it thinks it is to its goal; [] without a goal."""
+        self._plan: list[int] = []
         self.is_paused = False
         self.practice_share: float | None = None
         self.map_version = 0
@@ -64,7 +67,7 @@ class Drive:
         self._seed += 1
         self.executor = self.agent.executor(node, seed=self._seed)
         self.goal, self.num_plans = node, 0
-        self._plan: list[int] = []
+        self.path = self._plan = []
         self._status = "running"
         self._tell(f"going to node {node}")
 
@@ -115,7 +118,7 @@ class Drive:
         """Take one control step, unless it is paused or practises."""
         if self.is_paused or self.practice_share is not None:
             return
-        action = self.executor.act(self.observation)
+        action = self._act()
         self._report()
         if self._is_over:
             self._sense(*self.env.reset())
@@ -149,12 +152,6 @@ class Drive:
         is_strange = self.agent.log_emission(normal).max() < self.agent.least_familiar
         return bool(self.executor.recovering or is_strange or self.executor.belief.max() < UNSURE)
 
-    @property
-    def path(self) -> list[int]:
-        """The planned nodes, from where it thinks it is to its goal; [] without a goal."""
-        is_under_way = self.goal is not None and self.executor.status == "running"
-        return list(self.executor.path) if is_under_way else []
-
     def place_nodes(self) -> None:
         """Lay the map out: by ground truth where the logs have one, else from the graph."""
         self.place, self.is_true_place = scoring.node_places(self.agent, self.logs, self.world)
@@ -167,9 +164,21 @@ class Drive:
 
     def _wait(self) -> None:
         """Go nowhere, and keep recognising."""
-        self.executor = self.agent.executor(lambda node: True, seed=self._seed)
+        self.executor = self.agent.executor(0, seed=self._seed)  # it only watches
         self.goal, self._status = None, "reached"
-        self._plan = []
+        self.path = self._plan = []
+
+    def _act(self) -> NDArray[np.float32]:
+        """Decide what to do now; without a goal, nothing."""
+        if self.goal is None:
+            self.executor.watch(self.observation)
+            action: NDArray[np.float32] = self.agent.rest_action
+        else:
+            action = self.executor.act(self.observation)
+        is_under_way = self.goal is not None and self.executor.status == "running"
+        # Asked for once a step: where plans are made by looking ahead, it takes a while.
+        self.path = list(self.executor.path) if is_under_way else []
+        return action
 
     def _sense(self, observation: NDArray[np.float32], info: dict[str, Any]) -> None:
         self.observation = observation
@@ -182,12 +191,12 @@ class Drive:
         """Tell of what the last decision changed."""
         if self.goal is None:
             return
-        path = self.path
-        if path:
-            if self._plan and path != self._plan[-len(path) :]:
+        if self.path:
+            if self._plan and self.path != self._plan[-len(self.path) :]:
                 self.num_plans += 1
-                self._tell(f"re-planned: {len(path) - 1} nodes to go")
-            self._plan = path
+                left = len(self.path) - 1
+                self._tell(f"re-planned: {left} node{'s' * (left != 1)} to go")
+            self._plan = self.path
         if self.is_lost and not self._was_lost and self.executor.status == "running":
             self._tell("lost")
         self._was_lost = self.is_lost
@@ -235,7 +244,7 @@ class Watched(gym.Wrapper):
         drive._sense(observation, info)
         if len(drive.executor.belief) != drive.agent.num_nodes:
             drive._wait()  # the map has grown
-        drive.executor.act(observation)  # it goes nowhere, and recognises what is seen
+        drive.executor.watch(observation)
         return observation, float(reward), terminated, truncated, info
 
     def log(self) -> Trajectory | None:

@@ -6,8 +6,9 @@ python -m experiments.execute --model acrobot.safetensors --env Acrobot-v1 --hol
 
 "believed" counts the tasks that the agent says it has done. "true" needs to know where the goals
 are: a maze's places are known, its nodes only by the training log (--log). In an environment
-without a ground truth of ours it asks that the last observation is near the goal node's mean, and
-random actions are tried on the same goals: what they reach by chance the agent must exceed.
+without a ground truth of ours it asks that the last observation is as near to the goal node's
+mean as what is seen at that node is on average, and random actions are tried on the same goals:
+what they pass by at any time the agent must exceed by where it says that it has arrived.
 """
 
 import contextlib
@@ -24,6 +25,7 @@ from tqdm import tqdm
 from experiments import cli, figures, scoring
 from experiments.scoring import MAZE, NodeTable, Task, Trial, World
 from rfl_torch import Agent
+from rfl_torch.innate import action_bounds
 from rfl_torch.monitor import TensorBoardMonitor
 
 
@@ -121,9 +123,11 @@ def main(config: Config) -> None:
                 walks_json[name] = walk._asdict()
                 rows.append(["random walk", "-", str(walk), "-", "-", "-"])
                 note = (
-                    f"\ntrue: the last observation is within {scoring.OBSERVED_TOLERANCE:g} of the "
-                    "goal node's mean, rms over the readings, each as a share of its range in the "
-                    f"log; the random walk's: any observation of {limit} steps."
+                    "\ntrue: the agent says so, and its last observation is within the goal node's "
+                    f"width, or {scoring.OBSERVED_TOLERANCE:g} if that is more, of the node's mean "
+                    "(rms over the readings, each as a share of its range in the log; the width is "
+                    "the rms distance of what is seen there). The random walk's: any observation "
+                    f"of {limit} steps is."
                 )
     if config.results is not None:
         results = {
@@ -276,7 +280,7 @@ def _check(config: Config) -> None:
 
 def check_fit(agent: Agent, env: gym.Env) -> None:
     """Refuse an environment that the agent has not learned from."""
-    shapes = (env.observation_space.shape, env.action_space.shape)
+    shapes = (env.observation_space.shape, action_bounds(env.action_space)[0].shape)
     needed = (agent.observation_low.shape, agent.rest_action.shape)
     if shapes != needed:
         raise ValueError(

@@ -243,7 +243,8 @@ def describe_way(drive: Drive) -> str:
         return f"It has reached node {drive.goal}."
     if drive.executor.status == "gave_up":
         return f"It gave up on node {drive.goal}: {drive.executor.reason}."
-    way = f"{len(drive.path) - 1} nodes to go" if drive.path else "no way known yet"
+    left = len(drive.path) - 1
+    way = f"{left} node{'s' * (left != 1)} to go" if drive.path else "no way known yet"
     return f"It goes to node {drive.goal}: {way}, re-planned {drive.num_plans} times."
 
 
@@ -300,6 +301,9 @@ def moving_series(drive: Drive) -> list[dict[str, Any]]:
     goal = place[:0] if drive.goal is None else place[[drive.goal]]
     path = [n for n in drive.path if n < len(place)]
     is_placed = _is_placed(drive)
+    # Near the goal the names would cover each other and the marks.
+    is_above = len(goal) == 0 or len(here) == 0 or goal[0][1] > here[0][1]
+    goal_side, here_side = ("top", "bottom") if is_above else ("bottom", "top")
     return [
         {
             "name": BELIEF,
@@ -318,8 +322,8 @@ def moving_series(drive: Drive) -> list[dict[str, Any]]:
         },
         _line(TRAIL, np.array(drive.trail) if is_placed else [], GREEN, 2, "solid", 3),
         _line(PLAN, place[path], ORANGE, 4, "solid", 5),
-        _mark(GOAL, goal, 26, "transparent", RED, 4, "goal", "top", 12),
-        _mark(BELIEVED, here, 15, BLUE, "#ffffff", 2, "thinks it is here", "bottom", 13),
+        _mark(GOAL, goal, 26, "transparent", RED, 4, "goal", goal_side, 12),
+        _mark(BELIEVED, here, 15, BLUE, "#ffffff", 2, "thinks it is here", here_side, 13),
         _mark(
             TRUE,
             [drive.truth] if is_placed else [],
@@ -413,6 +417,7 @@ def _mark(
             "show": True,
             "formatter": label,
             "position": side,
+            "distance": 18 - size // 2,  # beyond the largest mark, which may be around this one
             "fontSize": 13,
             "fontWeight": "bold",
             "color": border if colour == "transparent" else colour,

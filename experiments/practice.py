@@ -69,7 +69,7 @@ def main(config: Config) -> None:
     cli.check_count("--num-steps", config.num_steps)
     with contextlib.ExitStack() as stack:
         arguments = (config.env, config.layout, config.env_kwargs, config.observation_keys)
-        made = cli.with_action_rows(cli.make_env(*arguments))
+        made = cli.make_env(*arguments)
         env = Continued(stack.enter_context(made), config.seed)
         agent = Agent.load(config.model)
         check_fit(agent, env)
@@ -126,13 +126,13 @@ class Continued(gym.Wrapper):
     """An environment in which a practice goes on where the last one ended, and that can be redone.
 
     Args:
-        env: taking action rows.
+        env: environment to continue.
         seed: of the first reset; later resets with a seed are left out.
     """
 
     def __init__(self, env: gym.Env, seed: int) -> None:
         super().__init__(env)
-        self.actions: list[NDArray[np.float32]] = []
+        self.actions: list[NDArray[Any]] = []
         self._observation, _ = env.reset(seed=seed)
 
     def reset(
@@ -143,15 +143,15 @@ class Continued(gym.Wrapper):
             self._observation, _ = self.env.reset(options=options)
         return self._observation, {}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step, and note it."""
-        self.actions.append(np.array(action, np.float32))
+        self.actions.append(np.array(action))
         result = self.env.step(action)
         self._observation = result[0]
         return result
 
-    def repeat(self, actions: NDArray[np.float32]) -> None:
-        """Do all of an earlier run's actions (T, A), from the same first reset."""
+    def repeat(self, actions: NDArray[Any]) -> None:
+        """Do all of an earlier run's actions, from the same first reset."""
         for action in tqdm(actions, desc="doing again", unit="step"):
             _, _, terminated, truncated, _ = self.step(action)
             if terminated or truncated:
@@ -167,7 +167,7 @@ class Kept:
     def __init__(self, folder: Path, identity: str) -> None:
         self._folder, self._identity = folder, identity
 
-    def latest(self) -> tuple[Agent, NDArray[np.float32], list[Attempt]] | None:
+    def latest(self) -> tuple[Agent, NDArray[Any], list[Attempt]] | None:
         """Return the agent, the actions and the attempts so far; None for nothing usable."""
         for path in sorted(self._folder.glob("actions-*.safetensors"), reverse=True):
             try:
@@ -181,7 +181,7 @@ class Kept:
                 print(f"note: {error}; it is not taken up", file=sys.stderr)
         return None
 
-    def through(self, agent: Agent, actions: NDArray[np.float32], history: list[Attempt]) -> Agent:
+    def through(self, agent: Agent, actions: NDArray[Any], history: list[Attempt]) -> Agent:
         """Keep the state, drop older ones; returns the agent as the file has it."""
         self._folder.mkdir(exist_ok=True)
         num_steps = len(actions)

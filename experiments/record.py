@@ -4,7 +4,7 @@ python -m experiments.record --env rfl/RangefinderMaze-v0 --num-steps 10000 --ou
 python -m experiments.record --env rfl/TorquePendulum-v0 --hold 30 --levels 3 --out swings.npz
 python -m experiments.record --env Acrobot-v1 --hold 4 --out acrobot.npz
 python -m experiments.record --env gymnasium_robotics:PointMaze_UMaze-v3 \
-    --observation-keys observation --hold 10 --out point.npz
+    --observation-keys observation --hold 10 --levels 3 --out point.npz
 """
 
 from collections.abc import Sequence

@@ -7,8 +7,8 @@
     chained       each task starts where the last one ended, the first where the log ended
     independent   each task starts at a random free place of its own
 
-    observed      where the environment tells no ground truth: how near the last observation is to
-                  the goal node's mean, which the agent does not decide by
+    observed      where the environment tells no ground truth: an observation is at a node that it
+                  is as near to as what is seen there is on average, see `observed_near`
 
 A task that starts at its goal counts like any other.
 """
@@ -37,7 +37,8 @@ NODE_SPACING = 44.0  # mm; the paper's, sqrt(1000 * 600 / 309)
 WORMHOLE_SPREAD = 60.0  # mm
 PLACE_TOLERANCE = 60.0  # mm
 OBSERVED_TOLERANCE = 0.05
-"""Rms over readings, each as a share of its range in the log: a node's width on a 20 x 20 map."""
+"""Rms over readings, each as a share of its range in the log: what counts as near in any case, a
+node's width on a 20 x 20 map."""
 UPRIGHT_TOLERANCE = 0.3  # rad
 UPRIGHT = (math.pi, 0.0)
 
@@ -464,8 +465,8 @@ def run_tasks(
         executor = agent.executor(task.goal, seed=seed + index)
         outcome = run_task(env, executor, observation, info, steps)
         if world is None:
-            is_near = observed_distance(agent, outcome.observation, executor.goal)
-            is_true: bool | None = outcome.is_believed and is_near <= OBSERVED_TOLERANCE
+            is_near = observed_near(agent, outcome.observation, executor.goal)
+            is_true: bool | None = outcome.is_believed and is_near
         else:
             is_true = _is_true(task, outcome, world)
         start_known = bool(start_density >= agent.least_familiar)
@@ -482,6 +483,16 @@ def observed_distance(agent: Agent, observation: NDArray[np.float32], node: int)
     """
     mean = agent.hmm.emission_mean[node].detach().numpy()
     return float(np.sqrt(np.nanmean((agent.normalize(observation) - mean) ** 2)))
+
+
+def observed_near(agent: Agent, observation: NDArray[np.float32], node: int) -> bool:
+    """Say whether an observation is at a node: the one rule for the agent and the random walk.
+
+    Its distance from the node's mean is at most the node's width, the rms distance of what is seen
+    there, or OBSERVED_TOLERANCE if that is more.
+    """
+    width = float(agent.node_width(np.array([node]))[0])
+    return observed_distance(agent, observation, node) <= max(width, OBSERVED_TOLERANCE)
 
 
 def longest_stay(env: gym.Env, executor: Any, outcome: Outcome, task: Task, world: World) -> int:
@@ -550,7 +561,7 @@ def observed_walk_share(
     seed: int,
     levels: int | None = None,
 ) -> "Share":
-    """Return the share of goals that random actions come to, by `observed_distance`, at any time.
+    """Return the share of goals that random actions come to, by `observed_near`, at any time.
 
     Like the agent's tasks the walk's follow on each other, with as many steps for each.
 
@@ -569,7 +580,7 @@ def observed_walk_share(
     is_over = False
     for goal in goals:
         for step in range(limit + 1):
-            if observed_distance(agent, observation, goal) <= OBSERVED_TOLERANCE:
+            if observed_near(agent, observation, goal):
                 found += 1
                 break
             if step == limit:

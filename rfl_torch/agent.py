@@ -608,6 +608,14 @@ class Agent:
         """
         return apart(normal, self._mean[node]) / self.look_radius
 
+    def node_width(self, nodes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """How far from the nodes' (G,) means observations of them are, (G,).
+
+        The rms over readings and observations, each reading as a share of its range in the log.
+        """
+        scale = self.hmm.emission_scale.detach().numpy()[nodes]
+        return np.asarray(np.sqrt((scale**2).mean(-1)))
+
     def log_emission(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Tempered log-density of one normalised observation (D,) under every node, (N,)."""
         return inference.log_emission(self.chain, normal[None])[0, self.chain.cell]

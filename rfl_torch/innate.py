@@ -150,7 +150,7 @@ def _record(
         row = innate.act()
         action = env_action(space, row)
         observation, _, terminated, truncated, info = env.step(action)
-        actions.append(np.eye(len(row))[row.argmax()] if _is_discrete(space) else row)
+        actions.append(done_row(space, row))
         observations.append(observation)
         truths.append(info.get("ground_truth"))
         is_last = step + 1 == num_steps
@@ -178,6 +178,14 @@ def action_bounds(space: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]
 def env_action(space: Any, row: NDArray[np.float32]) -> Any:
     """What the environment is given for an action row (A,): of a Discrete space its largest."""
     return int(space.start) + int(np.argmax(row)) if _is_discrete(space) else row
+
+
+def done_row(space: Any, row: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a log says of an action row (A,): of a Discrete space the one-hot row of what was done.
+
+    Else rows that lead to the same action would look like different ones.
+    """
+    return np.eye(len(row), dtype=np.float32)[np.argmax(row)] if _is_discrete(space) else row
 
 
 def _is_discrete(space: Any) -> bool:

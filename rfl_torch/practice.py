@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rfl_torch.innate import directions, nearest_direction
+from rfl_torch.innate import directions, done_row, env_action, nearest_direction
 from rfl_torch.planner import cost_to_go
 from rfl_torch.search import HOLD, Search
 from rfl_torch.trajectory import Trajectory
@@ -142,9 +142,10 @@ class _Run:
         self.finished: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
 
     def step(self, action: NDArray[np.float32]) -> None:
-        self.observation, _, terminated, truncated, _ = self.env.step(action)
+        space = self.env.action_space
+        self.observation, _, terminated, truncated, _ = self.env.step(env_action(space, action))
         self._observations.append(np.asarray(self.observation, np.float32))
-        self._actions.append(action)
+        self._actions.append(done_row(space, action))
         self.left -= 1
         self.done += 1
         if terminated or truncated:

@@ -56,15 +56,24 @@ class Goal:
     """One or more situations to come to (G, 2 E), and how near is near enough.
 
     An observation is near within a landmark spacing, or half of what the goal moves in a step:
-    steps may end no nearer. A change of observation is near within a spacing.
+    steps may end no nearer. A change of observation is near within a spacing. Where observations
+    show how things go, landmarks lie closer than what is seen at one node: near is then within the
+    node's width, and any change will do.
+
+    Args:
+        motion: of the log.
+        center: situations (G, 2 E).
+        width: of each one's node, (G,), see `Agent.node_width`.
     """
 
-    def __init__(self, motion: Motion, center: Array) -> None:
+    def __init__(self, motion: Motion, center: Array, width: Array) -> None:
         self.obs_dim, self.scale, self.center = motion.obs_dim, motion.scale, center
-        move = np.linalg.norm(self.center[:, self.obs_dim :], axis=1) / self.scale[0]
-        self.reach = np.stack(
-            [np.maximum(motion.spacing, move / 2), np.full(len(center), motion.spacing)], 1
-        )
+        if motion.is_shown:
+            length = width * np.sqrt(self.obs_dim) / self.scale[0]
+        else:
+            move = np.linalg.norm(self.center[:, self.obs_dim :], axis=1) / self.scale[0]
+            length = np.maximum(motion.spacing, move / 2)
+        self.reach = np.stack([length, np.full(len(center), motion.spacing)], 1)
 
     def distance(self, situation: Array) -> Array:
         """Distance (...) from situations (..., 2 E) to the nearest center; up to 1 is near."""
@@ -143,7 +152,8 @@ class SteeringExecutor:
         self._agent, self._motion = agent, motion
         self._mean = agent.hmm.emission_mean.detach().numpy()
         self.goal = int(goals[0])
-        self._target = Goal(motion, np.stack([self._center(node) for node in goals]))
+        center = np.stack([self._center(node) for node in goals])
+        self._target = Goal(motion, center, agent.node_width(goals))
         self._time = time_to_goal(motion, self._target)
         self._regret: Array | None = None
         self._filter = inference.start_filter(agent.chain)
@@ -206,7 +216,7 @@ class SteeringExecutor:
 
     def _center(self, node: int) -> Array:
         """Where a node is; one that the log only starts or ends in is taken to be at rest."""
-        center = self._motion.center(node)
+        center = None if self._motion.is_shown else self._motion.center(node)
         rest = np.concatenate([self._mean[node], np.zeros_like(self._mean[node])])
         return rest if center is None else center
 

@@ -1,15 +1,17 @@
 """Environments that were not written here: from their id to goals, by the commands alone."""
 
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from PIL import Image
 
-from experiments import cli, execute, record, scoring, train
+from experiments import cli, environments, execute, record, scoring, train
 from rfl_torch import Agent, AgentConfig, Stage, read_logs
 from rfl_torch.innate import check_spaces
 
@@ -143,3 +145,77 @@ def test_the_observed_measure_is_the_rms_over_known_readings_in_their_ranges(tmp
     assert scoring.observed_distance(agent, away, 3) == pytest.approx(0.5 / 3**0.5)
     away[0] = np.nan
     assert scoring.observed_distance(agent, away, 3) == pytest.approx(0.4 / 2**0.5)
+
+
+def test_near_is_within_the_nodes_width_for_the_agent_and_the_walk_alike(tmp_path):
+    _, agent = go(tmp_path, "Pendulum-v1")
+    with torch.no_grad():
+        agent.hmm.emission_log_scale[3] = torch.tensor([0.3, 0.1, 0.2]).log()
+        agent.hmm.emission_log_scale[4] = np.log(0.01)
+    mean = agent.hmm.emission_mean.detach().numpy()
+    width = ((0.3**2 + 0.1**2 + 0.2**2) / 3) ** 0.5
+
+    def seen(node, away):
+        return agent.observation_low + (mean[node] + away) * agent.observation_scale
+
+    for node, limit in ((3, width), (4, scoring.OBSERVED_TOLERANCE)):
+        assert scoring.observed_near(agent, seen(node, 0.99 * limit), node)
+        assert not scoring.observed_near(agent, seen(node, 1.01 * limit), node)
+    still = Still(seen(3, 0.99 * width))
+    assert scoring.observed_walk_share(still, agent, [3, 4, 3], 5, 1, 0).share == 2 / 3
+    (trial,) = scoring.run_tasks(
+        still, Arrived(agent, 4), [scoring.Task(4, None)], None, None, 0, 5
+    )
+    assert trial.outcome.is_believed
+    assert not trial.is_true
+    (trial,) = scoring.run_tasks(
+        still, Arrived(agent, 3), [scoring.Task(3, None)], None, None, 0, 5
+    )
+    assert trial.is_true
+
+
+class Still:
+    """A world in which nothing changes."""
+
+    def __init__(self, observation):
+        self.observation = observation
+
+    def reset(self, **_):
+        return self.observation, {}
+
+    def step(self, _):
+        return self.observation, 0.0, False, False, {}
+
+
+class Arrived:
+    """An agent that says at once that it is there."""
+
+    def __init__(self, agent, node):
+        self._agent, self._node = agent, node
+
+    def __getattr__(self, name):
+        return getattr(self._agent, name)
+
+    def executor(self, goal, seed):
+        own = SimpleNamespace(status="reached", goal=goal, node=self._node, path=[], reason="")
+        own.act = lambda observation: self._agent.rest_action
+        return own
+
+
+def test_one_command_prints_all_environments_against_the_random_walk(monkeypatch, capsys):
+    monkeypatch.setattr(environments, "AgentConfig", lambda: AgentConfig((4, 4), stages=SHORT))
+    few = [world for world in environments.WORLDS if ":" not in world.env_id][1:]
+    monkeypatch.setattr(environments, "WORLDS", few)
+    environments.main(environments.Config(seeds=1, num_steps=400, trials=3, limit=10))
+    out = capsys.readouterr().out
+    for world, kind in zip(few, ("Box", "Discrete"), strict=True):
+        assert re.search(rf"^{world.env_id} +{kind} +\d/3 .* \d/3 ", out, re.M)
+
+
+def test_the_worlds_of_the_table_babble_as_the_docs_say():
+    docs = (Path(__file__).parents[1] / "docs" / "choosing.md").read_text()
+    for world in environments.WORLDS:
+        options = f"--hold {world.hold}"
+        options += f" --levels {world.levels}" if world.levels else ""
+        options += "".join(f" --observation-keys {key}" for key in world.observation_keys)
+        assert f"| `{world.env_id}` | `{options}` |" in docs

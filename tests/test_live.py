@@ -201,6 +201,7 @@ def test_an_ended_episode_begins_anew():
         patch.setattr(scoring, "node_places", lambda *_: (np.zeros((1, 2)), False))
         with cli.with_action_rows(gym.make("CartPole-v1")) as env:
             drive = Drive(env, agent, [])
+            drive.goal = 0
             drive_until(drive, lambda: "the episode ended: back at the start" in texts(drive), 40)
             assert abs(drive.observation[2]) < 0.05
 

@@ -17,11 +17,13 @@ from rfl_torch.motion import (
     Motion,
     apart,
     choices,
+    held_steps,
+    left_open,
     remember,
     remember_more,
     spread_out,
 )
-from rfl_torch.steering import time_to_goal
+from rfl_torch.steering import Goal, time_to_goal
 
 STEP = 0.05  # s
 PUSH = 1.0  # acceleration of the full action
@@ -44,6 +46,13 @@ class Cart:
         return self.state[:1].astype(np.float32)
 
 
+class OpenCart(Cart):
+    """The same, but it shows how fast it goes, too."""
+
+    def see(self):
+        return self.state.astype(np.float32)
+
+
 class Swing:
     """A pendulum that shows its angle in turns, from 0 to 1; its motor can't hold it level."""
 
@@ -60,11 +69,11 @@ class Swing:
         return np.array([self.state[0] / (2 * np.pi) + 0.5], np.float32) % 1
 
 
-def record(world, num_steps=4000, seed=0):
+def record(world, num_steps=4000, seed=0, hold=30):
     rng, cart = np.random.default_rng(seed), world()
     observations, actions, truth = [cart.see()], [], [cart.state]
     for step in range(num_steps):
-        if step % 30 == 0:
+        if step % hold == 0:
             action = rng.integers(-1, 2, 1).astype(np.float32)
         actions.append(action)
         observations.append(cart.step(action))
@@ -129,6 +138,76 @@ def test_what_a_choice_leads_to_is_what_the_world_does(log, motion):
             error.append(np.abs(trace - np.concatenate(seen))[:held].max())
     # A full push held for HORIZON steps moves the cart by 0.14.
     assert np.quantile(error, 0.99) < 0.01
+
+
+def test_what_short_holds_teach_is_strung_together_to_long_ones():
+    log = record(OpenCart, hold=4)
+    motion, rng = Motion(memory_of(log)), np.random.default_rng(0)
+    low, high = log.observations.min(0), log.observations.max(0)
+    error = []
+    for row in rng.integers(200, 3800, 60):
+        now = (log.observations[[row - 1, row]] - low) / (high - low)
+        prospect = motion.look_ahead(np.concatenate([now[1], now[1] - now[0]])[None])
+        for k, choice in enumerate(motion.choices):
+            cart = OpenCart(*log.ground_truth[row])
+            seen = np.stack([cart.step(2 * choice - 1) for _ in range(HORIZON)])
+            trace = prospect.trace[0, k, :, :2] * (high - low) + low
+            held = prospect.num_steps[0, k]
+            error.append(np.abs(trace - seen)[:held].max())
+    # A full push held for HORIZON steps changes the speed by 0.6, and moves the cart by 0.14.
+    assert prospect.trace.shape[2] == HORIZON
+    assert np.quantile(error, 0.95) < 0.02
+
+
+@pytest.mark.parametrize("hold", [1, 2, 4, 5, 30])
+def test_models_reach_as_far_as_half_of_the_actions_are_held(hold):
+    memory = memory_of(record(Cart, 900, hold=hold))
+    memory = memory._replace(start=np.array([0, 100, 107]))
+    ends, left = [100, 107, 901], []
+    for row, action in enumerate(memory.action):
+        end = next(end for end in ends if row < end)
+        same = (memory.action[row:end] == action).all(1)
+        left.append(int(np.argmin(same)) if not same.all() else end - row)
+    longest = max(k for k in range(1, HORIZON + 1) if np.mean(np.array(left) >= k) >= 0.5)
+    assert held_steps(memory) == longest
+
+
+def test_what_alike_situations_leave_open_is_that_of_the_nearest_at_another_time():
+    rng = np.random.default_rng(0)
+    time = np.concatenate([np.arange(200), np.arange(300, 420)])
+    situation, change = rng.random((320, 3)), rng.normal(size=(320, 2))
+    action = rng.integers(2, size=(320, 1)).astype(np.float32)
+    difference = []
+    for i in range(320):
+        away = np.linalg.norm(situation - situation[i], axis=1)
+        away[(action != action[i]).any(1)] = np.inf
+        nearest = np.argsort(away)[:HORIZON]  # it looks no further
+        others = nearest[np.abs(time[nearest] - time[i]) > 2 * HORIZON]
+        difference += [np.abs(change[others[0]] - change[i])] if len(others) else []
+    expected = (np.mean(difference, 0) / np.abs(change).mean(0)).mean()
+    assert left_open(situation, change, action, time) == pytest.approx(expected, rel=1e-12)
+    assert np.isnan(left_open(situation[:20], change[:20], action[:20], time[:20]))
+
+
+def test_motion_is_taken_from_changes_unless_observations_show_it(motion):
+    shown = Motion(memory_of(record(OpenCart)))
+    assert shown.is_shown
+    assert not motion.is_shown
+    situation = shown.landmark[:1].copy()
+    situation[0, shown.obs_dim :] += 0.5  # of the range: never seen
+    assert shown.stray(situation) == 0
+    near, weight = shown.interpolate(situation)
+    assert near[0, 0] == 0
+    assert weight[0, 0] > 0.5
+
+
+def test_a_goal_whose_motion_shows_is_near_within_its_nodes_width():
+    motion = Motion(memory_of(record(OpenCart)))
+    center = np.array([[0.5, 0.5, 0.0, 0.0]])
+    goal = Goal(motion, center, np.array([0.1]))  # rms of two readings: 0.1 sqrt(2) away
+    for offset, is_near in (([0.1, 0.099], True), ([0.14, 0.0], True), ([0.1, 0.101], False)):
+        situation = center[0] + [*offset, 0.3, 0.0]
+        assert (goal.distance(situation) <= 1) == is_near
 
 
 def test_the_choices_are_the_distinct_actions_of_the_log():

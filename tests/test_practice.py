@@ -6,7 +6,7 @@ import torch
 from test_growth import covered, half_log
 from worlds import DotWorld, dot_config, dot_log
 
-from rfl_torch import Agent
+from rfl_torch import Agent, record
 from rfl_torch.innate import nearest_direction
 from rfl_torch.practice import Goals, Strategy, untried
 
@@ -62,6 +62,41 @@ def test_no_transition_is_learned_across_the_end_of_an_episode(half_path):
     agent.practice(world, 400)
     assert world.resets == 1 + 400 // 40
     assert agent.edges.sum() == before + 400
+
+
+class ChoiceWorld(DotWorld):
+    """Five choices instead of two numbers: stand still, or move along a side."""
+
+    moves = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+
+    class _Choices:
+        n, start = 5, 0
+
+    _Choices.__name__ = "Discrete"
+
+    def __init__(self):
+        super().__init__()
+        self.action_space, self.chosen = self._Choices(), []
+
+    def step(self, action):
+        assert isinstance(action, int)
+        self.chosen.append(action)
+        return super().step(self.moves[action])
+
+
+def test_practice_gives_an_environment_its_choices_and_learns_what_was_chosen():
+    world = ChoiceWorld()
+    agent = Agent(dot_config(repairs=False)).fit(record(world, 800, seed=1))
+    before, tried = agent.edges.sum(), agent.tried.sum()
+    world.chosen.clear()
+    agent.practice(world, 600)
+    assert len(world.chosen) == 600
+    assert len(set(world.chosen)) == 5
+    assert agent.edges.sum() == before + 600
+    assert agent.tried.sum() == tried + 600  # each step was a whole choice, none a mixture
+    rows = agent.samples.action.numpy()
+    assert set(np.unique(rows)) == {0.0, 1.0}
+    assert (rows.sum(1) == 1).all()
 
 
 def test_practice_is_the_same_for_the_same_seed(half_path):

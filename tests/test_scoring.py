@@ -289,10 +289,12 @@ def test_independent_tasks_start_at_their_own_place():
     assert [t.outcome.trace[0, 0] for t in trials] == [70, 30]
 
 
-def test_world_without_ground_truth_is_judged_by_the_last_observation():
-    """The robot is at 20 after each task's two actions, the goal's mean at 20.04: 0.05 is near."""
+@pytest.mark.parametrize(("mean", "width"), [(20.04, 0.01), (20.19, 0.2)])
+def test_world_without_ground_truth_is_judged_by_the_last_observation(mean, width):
+    """The robot is at 20 after each task's two actions; a node's width is near, 0.05 at least."""
     agent = agent_saying("reached")
-    agent.hmm = SimpleNamespace(emission_mean=torch.tensor([[20.04]]))
+    agent.hmm = SimpleNamespace(emission_mean=torch.tensor([[mean]]))
+    agent.node_width = lambda nodes: np.full(len(nodes), width)
     tasks = [Task(0, None)] * 2
     trials = list(scoring.run_tasks(Line(is_told=False), agent, tasks, None, None, 0))
     assert [t.outcome.observation.item() for t in trials] == [20.0, 40.0]
