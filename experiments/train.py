@@ -8,6 +8,7 @@ tensorboard --logdir runs
 """
 
 import contextlib
+import math
 import sys
 import time
 import warnings
@@ -20,9 +21,12 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import cli
-from rfl_torch import Agent, AgentConfig, GridHMM, Statistics, Trajectory
+from rfl_torch import Agent, AgentConfig, GridHMM, Statistics, Trajectory, footprint
 from rfl_torch.learning import Progress
 from rfl_torch.monitor import TensorBoardMonitor
+
+MUCH = 2e9
+"""Bytes of memory from which on it is said beforehand how much learning takes."""
 
 CONFIGS: dict[str, Callable[[], AgentConfig]] = {
     "default": AgentConfig,
@@ -64,6 +68,7 @@ def main(config: Config) -> None:
     if config.side is not None:
         cli.check_count("--side", config.side)
         choices = replace(choices, shape=(config.side, config.side))
+    foretell(choices, logs)
     begin = time.perf_counter()
     with contextlib.ExitStack() as stack:
         board = None
@@ -79,6 +84,16 @@ def main(config: Config) -> None:
         f"{agent.record[-1].log_likelihood_per_step:.3f}, {len(agent.record)} iterations in "
         f"{time.perf_counter() - begin:.0f} s"
     )
+
+
+def foretell(choices: AgentConfig, logs: list[Trajectory]) -> None:
+    """Say how much memory learning takes, if that is much."""
+    num_steps = sum(log.num_steps for log in logs)
+    obs_dim, action_dim = logs[0].observations.shape[1], logs[0].actions.shape[1]
+    cells = math.prod(choices.shape)
+    needed = footprint.to_fit(num_steps, obs_dim, action_dim, cells, choices.horizon)
+    if needed > MUCH:
+        print(f"note: {num_steps} steps take up to {needed / 1e9:.1f} GB to learn", file=sys.stderr)
 
 
 def fit(

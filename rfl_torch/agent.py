@@ -5,6 +5,7 @@ recognise the log (2.3), give its triplets to the nodes' controllers (2.4). Exec
 from a fitted agent and leave it unchanged.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
-from rfl_torch import growth, inference, learning, repair
+from rfl_torch import footprint, growth, inference, learning, repair
 from rfl_torch.agent_layout import check_state
 from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
 from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
@@ -133,8 +134,8 @@ class Agent:
                 Remove it once the agent is saved.
 
         Raises:
-            ValueError: if the logs are empty, too short, of different widths, or no reading
-                changes.
+            ValueError: if the logs are empty, too short, of different widths, if no reading
+                changes, or if they take more memory than there is.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
         self._forget()
@@ -191,12 +192,15 @@ class Agent:
         that exist keep their numbers. Executors made before are of the old map: make new ones.
 
         Raises:
-            ValueError: if a log has other readings or actions than those learned from.
+            ValueError: if a log has other readings or actions than those learned from, or takes
+                more memory than there is.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
         parts = [self.samples]
         for log in logs:
             self._check_log(log)
+            needed = footprint.to_extend(log.num_steps, self.hmm.obs_dim, self.num_nodes)
+            footprint.check(needed, f"taking {log.num_steps} steps into {self.num_nodes} nodes")
             observations = self.normalize(log.observations)
             actions = self._unit_actions(log.actions)
             path = self._extend_map(observations, actions)
@@ -319,6 +323,11 @@ class Agent:
                 f"1/{max(stage.stride for stage in self.config.stages)}; record thousands, "
                 "e.g. 10000."
             )
+        ((obs_dim, action_dim),) = widths
+        needed = footprint.to_fit(
+            num_steps, obs_dim, action_dim, math.prod(self.config.shape), self.config.horizon
+        )
+        footprint.check(needed, f"learning from {num_steps} steps of {obs_dim} readings")
         observations = np.concatenate([log.observations for log in logs])
         is_missing = np.isnan(observations)
         low = np.where(is_missing, np.inf, observations).min(0)
@@ -411,7 +420,7 @@ class Agent:
         self.tried = repair.count_directions(nodes, unit_actions, self.num_nodes)
         logs = list(zip(paths, observations, map(torch.from_numpy, unit_actions), strict=True))
         own_density = torch.cat([self._own_log_density(seen, path) for path, seen, _ in logs])
-        self.least_familiar = own_density.quantile(UNFAMILIAR_SHARE).item()
+        self.least_familiar = float(np.quantile(own_density, UNFAMILIAR_SHARE))
         # A missing reading is taken for the node's own, as `control` does.
         mean = self.hmm.emission_mean.detach()
         logs = [
@@ -446,10 +455,15 @@ class Agent:
     def _own_log_density(self, observations: Tensor, path: Tensor) -> Tensor:
         """Tempered log-density of each observation under its own node, (T,)."""
         hmm, power = self.hmm, self.config.power(self.hmm.obs_dim)
+        parts = []
         with torch.no_grad():
-            own = torch.distributions.Normal(hmm.emission_mean[path], hmm.emission_scale[path])
-            log_density = own.log_prob(observations.nan_to_num(0.0))
-        return power * log_density.masked_fill(observations.isnan(), 0.0).sum(1)
+            for seen, node in zip(
+                observations.split(repair.BATCH), path.split(repair.BATCH), strict=True
+            ):
+                own = torch.distributions.Normal(hmm.emission_mean[node], hmm.emission_scale[node])
+                log_density = own.log_prob(seen.nan_to_num(0.0))
+                parts.append(power * log_density.masked_fill(seen.isnan(), 0.0).sum(1))
+        return torch.cat(parts)
 
     def _prepare_recognition(self) -> None:
         self.chain = self.hmm.chain(self.config.power(self.hmm.obs_dim))

@@ -9,6 +9,7 @@ the same for one row without PyTorch's overhead, half of a control step, and
 `fit(inputs, targets, node)`; `SVRBank` in `online_svr` is the third.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,9 @@ from torch import Tensor, nn
 
 LEAST_SAMPLES = 8
 """A node with fewer samples borrows its neighbours' (see `pool_sparse_nodes`)."""
+
+MOST_AT_ONCE = 1 << 14
+"""Samples, with the padding, that are worked on at once: memory must not grow with the log."""
 
 
 class Triplets(NamedTuple):
@@ -39,10 +43,9 @@ class Triplets(NamedTuple):
 
 def next_node_entered(path: Tensor) -> Tensor:
     """For each step of a most likely path, the next other node that it turns into; -1 if none."""
-    entered = torch.full_like(path, -1)
-    for t in range(len(path) - 2, -1, -1):
-        entered[t] = path[t + 1] if path[t + 1] != path[t] else entered[t + 1]
-    return entered
+    turn = (path[1:] != path[:-1]).nonzero()[:, 0]
+    entered = torch.cat([path[turn + 1], path.new_full((1,), -1)])
+    return entered[torch.searchsorted(turn, torch.arange(len(path)))]
 
 
 def assign_triplets(path: Tensor, observations: Tensor, actions: Tensor, horizon: int) -> Triplets:
@@ -83,8 +86,16 @@ def explained(bank: nn.Module, triplets: Triplets) -> float:
 
     A robot that bumps into things moves as it was told most of the time, not all of it.
     """
+    parts = [triplets.inputs, triplets.node, triplets.action]
     with torch.no_grad():
-        error = (bank(triplets.inputs, triplets.node) - triplets.action).square().sum(1)
+        error = torch.cat(
+            [
+                (bank(inputs, node) - action).square().sum(1)
+                for inputs, node, action in zip(
+                    *(x.split(MOST_AT_ONCE) for x in parts), strict=True
+                )
+            ]
+        )
     return float(1 - error.median() / (triplets.action - 0.5).square().sum(1).median())
 
 
@@ -151,6 +162,24 @@ def group_by_node(inputs: Tensor, targets: Tensor, node: Tensor, num_nodes: int)
 def _array(parameter: Tensor, node: int) -> NDArray[np.float32]:
     """One node's part of a bank's parameter, not copied."""
     return parameter.detach().numpy()[node]
+
+
+def nodes_of_a_size(node: Tensor, num_nodes: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Nodes (K,) with about as many samples each, and all their samples (M,), part by part.
+
+    A few nodes have many more samples than most: padded to the fullest one of all, the samples of
+    a practised map would be four times as many. Nodes without samples are left out.
+    """
+    count = torch.bincount(node, minlength=num_nodes)
+    first, order = count.cumsum(0) - count, node.argsort(stable=True)
+    by_size = count.argsort(stable=True)
+    begin, sizes = int((count == 0).sum()), count[by_size].tolist()
+    for end in range(begin + 1, num_nodes + 1):
+        if end == num_nodes or sizes[end] * (end + 1 - begin) > MOST_AT_ONCE:
+            part = by_size[begin:end].sort().values
+            samples = [order[first[k] : first[k] + count[k]] for k in part.tolist()]
+            yield part, torch.cat(samples)
+            begin = end
 
 
 class MLPBank(nn.Module):
@@ -260,27 +289,38 @@ class RBFBank(nn.Module):
 
     @torch.no_grad()
     def fit(self, inputs: Tensor, targets: Tensor, node: Tensor, ridge: float = 0.1) -> float:
-        """Solve every node's ridge regression; returns the mean squared error."""
-        data = group_by_node(inputs, targets, node, len(self.center))
+        """Solve every node's ridge regression; returns the mean squared error.
+
+        Nodes without samples stay as they are.
+        """
+        square_error = 0.0
+        for own, samples in nodes_of_a_size(node, len(self.center)):
+            number = torch.searchsorted(own, node[samples])
+            data = group_by_node(inputs[samples], targets[samples], number, len(own))
+            square_error += self._solve(own, data, ridge)
+        return square_error / targets.numel()
+
+    def _solve(self, node: Tensor, data: Padded, ridge: float) -> float:
+        """Solve the regressions of some nodes (K,) on their samples; the sum of squared errors."""
         count = data.mask.sum(1)
         num_centers = self.center.shape[1]
         # Evenly spread over the node's samples, which stand in the order of time.
         place = torch.arange(num_centers) * count[:, None] // num_centers
-        rows = torch.arange(len(count))[:, None]
-        self.center.copy_(data.inputs[rows, place])
-        spread = data.inputs[rows, place].std(1).square().sum(-1).sqrt()
-        self.bandwidth.copy_(spread.nan_to_num(1.0).clamp(min=1e-3))
+        center = data.inputs[torch.arange(len(count))[:, None], place]
+        spread = center.std(1).square().sum(-1).sqrt()
+        bandwidth = spread.nan_to_num(1.0).clamp(min=1e-3)
         mask = data.mask[..., None]
-        features = self._features(data.inputs, self.center, self.bandwidth) * mask
-        bias = (data.targets * mask).sum(1) / count.clamp(min=1)[:, None]
-        bias = torch.where(count[:, None] > 0, bias, 0.5)
+        features = self._features(data.inputs, center, bandwidth) * mask
+        bias = (data.targets * mask).sum(1) / count[:, None]
         residual = (data.targets - bias[:, None]) * mask
         penalty = torch.ones(features.shape[-1])
         penalty[num_centers:] = 0.1
-        gram = features.mT @ features + ridge * torch.diag(penalty)
+        wide = features.double()  # summed in float32, 10,000 samples drown the ridge
+        gram = wide.mT @ wide + ridge * torch.diag(penalty)
         # By Cholesky: batched LU of matrices this large fails in some builds on several threads.
-        factor = torch.linalg.cholesky(gram.double())
-        self.weight.copy_(torch.cholesky_solve((features.mT @ residual).double(), factor))
-        self.bias.copy_(bias)
-        error = (features @ self.weight + bias[:, None] - data.targets) * mask
-        return float(error.square().sum() / (count.sum() * targets.shape[1]))
+        factor = torch.linalg.cholesky(gram)
+        weight = torch.cholesky_solve(wide.mT @ residual.double(), factor).float()
+        self.center[node], self.bandwidth[node] = center, bandwidth
+        self.weight[node], self.bias[node] = weight, bias
+        error = (features @ weight + bias[:, None] - data.targets) * mask
+        return float(error.square().sum())

@@ -20,7 +20,7 @@ from rfl_torch.innate import InnateController
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
 from rfl_torch.repair import LOOK_STEPS
 from rfl_torch.search import Search
-from rfl_torch.senses import FEW, apart, believed, sensible
+from rfl_torch.senses import FEW, Sensors, apart, believed, sensible
 from rfl_torch.steering import SteeringExecutor
 
 if TYPE_CHECKING:
@@ -43,6 +43,10 @@ FORGOTTEN = 0.01
 LONGEST_DOUBT = 60
 """Steps in a row that the map is followed while many readings don't fit: about a moved wall's
 reach. A robot whose senses are wrong everywhere is lost after that."""
+
+SOME = 0.2
+"""Share of the sights of the last LONGEST_DOUBT steps that must be familiar where arrival is said.
+To a robot whose senses are wrong everywhere, one in a hundred looks familiar, by chance."""
 
 LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
@@ -155,7 +159,9 @@ class BeliefExecutor:
         self.goal = int(goals[0])
         self._search = Search(*agent.action_bounds, agent.look_radius, seed)
         self.is_familiar = True
+        self._recent: deque[bool] = deque(maxlen=LONGEST_DOUBT)
         self._unfamiliar = self._weak = 0
+        self._sensors = Sensors(agent.hmm.obs_dim)
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         self._cost_to_go = cost_to_go(self._cost, goals)
         self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
@@ -186,7 +192,7 @@ class BeliefExecutor:
         normal = self._agent.normalize(observation)
         normal = self._recognize(normal)
         is_lost = self._unfamiliar >= LOST
-        is_there = self.belief[self._goals].sum() > 0.5 and self.is_familiar
+        is_there = self.belief[self._goals].sum() > 0.5 and self._is_sure()
         if self.status == "running" and is_there:
             if self._sight is None or self._sight_away(normal) <= 1 / LOOK_STEPS:
                 self.status = "reached"
@@ -215,6 +221,10 @@ class BeliefExecutor:
             return self._search.act(normal)
         return self._agent.control(normal, self._next)
 
+    def _is_sure(self) -> bool:
+        """Whether this sight is familiar and not the first after many strange ones."""
+        return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)
+
     def _sight_away(self, normal: NDArray[np.float64]) -> float:
         """How far what the robot sees is from what it was told to look for, in radii of a look."""
         assert self._sight is not None
@@ -225,7 +235,8 @@ class BeliefExecutor:
 
         Returns the readings that are believed; a frame without any leaves what was known.
         """
-        normal = sensible(normal)
+        sensed = sensible(normal)
+        normal = self._sensors.working(sensed)
         if self.node < 0:
             self.belief = self._first_belief(normal)
         teleport = self._config.teleport
@@ -239,6 +250,8 @@ class BeliefExecutor:
         self.belief = belief / belief.sum()
         self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
+        if self.is_familiar:
+            self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
         return normal
 
     def _doubt(
@@ -256,6 +269,7 @@ class BeliefExecutor:
             if doubted < 1.0:
                 log_emission = agent.log_emission(normal)
                 self.is_familiar = doubted <= FEW
+        self._recent.append(self.is_familiar)
         if self.is_familiar:
             self._unfamiliar = self._weak = 0
         elif doubted < 1.0 and self._weak < LONGEST_DOUBT:

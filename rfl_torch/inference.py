@@ -378,7 +378,7 @@ def _meet_in_the_middle(  # type: ignore[no-untyped-def]
         visit(0, slice(0, 1), gamma)
         return np.zeros((2, *shape)), gamma[0], log_likelihood
     middle = num_steps // 2
-    block = max(1, min(BLOCK, _MAX_ENTRIES // chain.num_cells, num_steps - middle))
+    block = min(block_steps(chain.num_cells), num_steps - middle)
     forward, backward = (_Message(chain, observations, ahead) for ahead in (True, False))
     with (
         _borrow_rows(block, chain.num_cells) as past_rows,
@@ -530,8 +530,9 @@ def most_likely_path(chain: Chain, observations: np.ndarray) -> np.ndarray:
     """
     observations = np.ascontiguousarray(observations, np.float64)  # the kernels index rows
     score = _first_score(chain, observations)
-    blocks = list(_blocks(slice(0, len(observations) - 1), _path_block(chain)))
-    choice = np.empty((min(len(observations) - 1, _path_block(chain)), chain.num_cells), np.uint16)
+    block_size = block_steps(chain.num_cells)
+    blocks = list(_blocks(slice(0, len(observations) - 1), block_size))
+    choice = np.empty((min(len(observations) - 1, block_size), chain.num_cells), np.uint16)
     starts = []
     for block in blocks:
         starts.append(score.copy())
@@ -549,9 +550,9 @@ def most_likely_path(chain: Chain, observations: np.ndarray) -> np.ndarray:
     return node_of_cell[path]
 
 
-def _path_block(chain: Chain) -> int:
-    """Steps whose choices are held at once."""
-    return max(1, min(BLOCK, _MAX_ENTRIES // chain.num_cells))
+def block_steps(num_cells: int) -> int:
+    """Steps whose messages or choices are held at once."""
+    return max(1, min(BLOCK, _MAX_ENTRIES // num_cells))
 
 
 def _first_score(chain: Chain, observations: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 A sensor that is dead, stuck or hit by an outlier disagrees with every place; the others still agree
 with one. Readings that don't fit the place that most of them agree on are taken as missing. Where a
 wall was moved, up to half of them don't fit: then only places that the robot may be at are asked.
+A sensor that is wrong at one familiar place after the other is broken, and goes missing.
 """
 
 import math
@@ -28,6 +29,9 @@ DOUBTED = 2.0
 LIKELY = 1e-3
 """Probability of a node from which on the robot may be at it."""
 
+OFTEN, RATE = 0.5, 0.1
+"""Share of the familiar sights in which a sensor is wrong that is broken, and how fast the share is
+learned."""
 
 FARTHEST = 1e6
 """Ranges of a reading in the log beyond which a number is no reading."""
@@ -72,3 +76,30 @@ def believed(normal: Array, mean: Array, predicted: Array, radius: float) -> tup
             is_wrong = difference[node] > DOUBTED * radius
             return np.where(is_wrong, np.nan, normal), float(is_wrong.sum() / num_readings)
     return normal, 1.0
+
+
+class Sensors:
+    """Follows which sensors are wrong wherever the robot is: those are broken, and go missing.
+
+    At most a share FEW of them: a robot that is elsewhere than it believes finds many wrong.
+
+    Args:
+        num_readings: D.
+    """
+
+    def __init__(self, num_readings: int) -> None:
+        self._wrong = np.zeros(num_readings)
+        self._most = int(FEW * num_readings)
+
+    def working(self, normal: Array) -> Array:
+        """The observation (D,) with NaN for what broken sensors say."""
+        if not self._most or self._wrong.max() <= OFTEN:
+            return normal
+        least = max(OFTEN, np.partition(self._wrong, -self._most - 1)[-self._most - 1])
+        return np.where(self._wrong > least, np.nan, normal)
+
+    def note(self, normal: Array, mean: Array, radius: float) -> None:
+        """Compare a familiar observation (D,) with the mean of its node, (D,)."""
+        difference = np.abs(normal - mean)
+        change = RATE * ((difference > DOUBTED * radius) - self._wrong)
+        self._wrong += np.where(np.isnan(difference), 0.0, change)

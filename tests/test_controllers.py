@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from rfl_torch import controllers
 from rfl_torch.agent import make_bank
 from rfl_torch.controllers import (
     LEAST_SAMPLES,
@@ -99,6 +100,35 @@ def test_one_call_for_all_rows_equals_a_call_for_each(kind):
         alone = np.stack([bank.at(row.numpy(), int(node)) for row, node in rows])
     assert alone.dtype == np.float32
     np.testing.assert_allclose(together, alone, atol=1e-5, rtol=1e-5)
+
+
+def test_nodes_with_few_and_many_samples_are_learned_as_each_alone(monkeypatch):
+    """Part by part, a few nodes at a time; tolerance: float32 sums of other lengths."""
+    monkeypatch.setattr(controllers, "MOST_AT_ONCE", 40)
+    triplets = linear_samples(num_nodes=6, per_node=60)
+    kept = torch.cat([(triplets.node == k).nonzero()[: 3 + 11 * k, 0] for k in (4, 0, 5, 2, 1)])
+    triplets = Triplets(*(field[kept] for field in triplets))
+    bank = make_bank("rbf", 6, 4, 2)
+    bank.fit(triplets.inputs, triplets.action, triplets.node)
+    for k in (0, 1, 2, 4, 5):
+        own = triplets.node == k
+        alone = make_bank("rbf", 1, 4, 2)
+        alone.fit(triplets.inputs[own], triplets.action[own], triplets.node[own] * 0)
+        for name, value in alone.state_dict().items():
+            torch.testing.assert_close(bank.state_dict()[name][k : k + 1], value, atol=1e-4, rtol=0)
+    parts = [own for own, _ in controllers.nodes_of_a_size(triplets.node, 6)]
+    assert sorted(torch.cat(parts).tolist()) == [0, 1, 2, 4, 5]
+    assert len(parts) > 2
+
+
+def test_a_node_with_many_samples_is_learned_where_readings_say_the_same():
+    """Four readings are one: the ridge alone tells them apart, and float32 would lose it."""
+    generator = torch.Generator().manual_seed(0)
+    once = 10 * torch.rand(20_000, 2, generator=generator)
+    inputs = once.repeat_interleave(4, 1)
+    action = 0.5 + 0.03 * (once[:, 1:] - once[:, :1])
+    bank = make_bank("rbf", 1, 4, 1)
+    assert bank.fit(inputs, action, torch.zeros(20_000, dtype=torch.int64)) < 1e-6
 
 
 @pytest.mark.parametrize("kind", BANKS)

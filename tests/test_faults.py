@@ -10,7 +10,7 @@ import sims  # noqa: F401
 from experiments import faults
 from experiments.faults import FAULTS
 from rfl_torch import Agent, AgentConfig, record
-from rfl_torch.senses import believed
+from rfl_torch.senses import Sensors, believed
 
 TASKS = 12
 
@@ -45,6 +45,26 @@ def test_a_turned_ring_is_reported_and_not_believed(agent, log, monkeypatch):
     assert tally.false == tally.never_lost == 0
 
 
+def test_a_familiar_sight_after_many_strange_ones_is_no_arrival_yet(agent):
+    """Its own sight must be a fifth of the last 60: twelve, after 60 strange ones."""
+    rng = np.random.default_rng(0)
+    goal = agent.raw_readings(agent.hmm.emission_mean[7].detach().numpy()).astype(np.float32)
+    executor = agent.executor(7)
+    executor.act(goal)
+    assert executor.status == "reached"  # nothing strange was seen before
+    executor = agent.executor(7)
+    for _ in range(60):
+        executor.act(rng.random(24).astype(np.float32) * agent.observation_scale.max())
+    assert not executor.is_familiar
+    said = []
+    for _ in range(12):
+        executor.act(goal)
+        assert executor.is_familiar
+        said.append(executor.status)
+    assert said == ["running"] * 11 + ["reached"]
+    assert executor.node == 7
+
+
 def test_readings_that_do_not_fit_where_the_others_agree_are_left_out():
     rng = np.random.default_rng(0)
     mean = rng.random((50, 24))
@@ -71,6 +91,26 @@ def test_half_of_the_readings_may_be_wrong_only_where_the_robot_may_be():
     left, share = believed(seen, mean, elsewhere, 0.03)
     assert share == 1.0
     np.testing.assert_array_equal(left, seen)
+
+
+def test_a_sensor_that_is_wrong_wherever_the_robot_is_goes_missing_until_it_works_again():
+    rng = np.random.default_rng(0)
+    mean = 0.2 + 0.6 * rng.random((200, 24))
+    sensors = Sensors(24)
+
+    def drive(broken, slips=0):
+        for node in rng.integers(200, size=30):
+            seen = mean[node] + 0.005 * rng.standard_normal(24)
+            seen[rng.choice(24, slips, replace=False)] += 0.5
+            seen[broken] = 1.0
+            sensors.note(seen, mean[node], 0.03)
+        return np.flatnonzero(np.isnan(sensors.working(seen)))
+
+    assert drive([], slips=4).size == 0  # each now and then
+    assert drive([3, 14], slips=1).tolist() == [3, 14]
+    assert drive([14]).tolist() == [14]
+    assert drive([]).size == 0
+    assert drive([0, 1, 2, 3, 4, 5]).size <= 2  # no sensor's fault: the robot is elsewhere
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 0.0])
