@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
-from rfl_torch import footprint, growth, inference, learning, repair
+from rfl_torch import footprint, growth, inference, learning, places, repair
 from rfl_torch.agent_layout import check_state
 from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
 from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
@@ -61,6 +61,10 @@ HOP_PROBABILITY = 0.005
 
 MOST_SAMPLES = 256
 """Triplets a node that are kept to learn from again when more come."""
+
+MOST_PLACES = 2
+"""Times as many nodes as by the grid's places that places by the track may make: with more, the
+actions don't add up to positions."""
 
 MOST_ROUNDS = 8
 """Times that a repaired map is counted and its logs recognised anew, until all nodes are used."""
@@ -161,7 +165,7 @@ class Agent:
         self.look_radius = repair.look_radius(self._filled(observations, paths), actions)
         loss = self._learn_controllers(observations, actions, paths)
         if config.repairs and self.is_reversible:
-            paths = self._repair(observations, paths)
+            paths = self._repair(observations, actions, paths)
             loss = self._learn_controllers(observations, actions, paths)
         else:
             self.statistics = self.hmm.e_step(observations, power)
@@ -370,13 +374,21 @@ class Agent:
             for sequence, path in zip(map(Tensor.numpy, observations), paths, strict=True)
         ]
 
-    def _repair(self, observations: list[Tensor], paths: list[Tensor]) -> list[Tensor]:
+    def _repair(
+        self,
+        observations: list[Tensor],
+        actions: list[NDArray[np.float32]],
+        paths: list[Tensor],
+    ) -> list[Tensor]:
         """Rebuild the map by looks and places; returns the logs' paths on the new one."""
         seen = self._filled(observations, paths)
         pooled = np.concatenate(seen)
         pooled_looks, _ = repair.center_looks(pooled, repair.find_looks(pooled, self.look_radius))
         looks = np.split(pooled_looks, np.cumsum([len(part) for part in seen])[:-1])
-        nodes = repair.split_by_place(looks, [path.numpy() for path in paths])
+        by_grid = repair.split_by_place(looks, [path.numpy() for path in paths])
+        most = MOST_PLACES * (1 + max(int(node.max()) for node in by_grid))
+        by_track = places.split_by_track(looks, seen, actions, self.look_radius, most)
+        nodes = by_grid if by_track is None else by_track
         values = [sequence.numpy() for sequence in observations]
         for _ in range(MOST_ROUNDS):
             self._count(nodes, values)
@@ -399,10 +411,11 @@ class Agent:
     def _rebuild(self) -> None:
         """Make the map what the counts say."""
         stage = self.config.stages[-1]
-        assert self.counts is not None
-        repair.rebuild(
-            self.hmm, self.counts, self.is_reversible, repair.MIN_SCALE, stage.pseudo_count
-        )
+        counts = self.counts
+        assert counts is not None
+        if self.is_reversible:  # else what looks the same differs in what doesn't show
+            counts = repair.tie(counts, self.config.power(self.hmm.obs_dim), repair.MIN_SCALE)
+        repair.rebuild(self.hmm, counts, self.is_reversible, repair.MIN_SCALE, stage.pseudo_count)
 
     def _learn_controllers(
         self,
@@ -479,6 +492,9 @@ class Agent:
         prob = self.hmm.log_transition().exp().detach().numpy()[rows, columns]
         seen = seen_edges(self.edges, self.is_reversible)
         self.alike = self._look_alikes(seen)
+        self.near = places.within(self.edges, places.NEAR)
+        self.twins = self._twins()
+        self.telling = places.find_telling(self.twins, self.edges)
         self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)
         self.map_cost = self.graph.data.copy()  # executors raise the graph's where they fail
         self.transition_in = self._with_hops(csr_array((prob, (rows, target)), shape=shape))
@@ -500,17 +516,26 @@ class Agent:
     def _look_alikes(self, seen: csr_array) -> csr_array:
         """Nodes that may be one place twice; none where a log can't run backwards.
 
-        There, nodes that look the same differ in what doesn't show, as a velocity does. Nodes with
-        an edge between them are neighbours, not doubles.
+        There, nodes that look the same differ in what doesn't show, as a velocity does. In a map
+        rebuilt by places they are different places. Nodes with an edge between them are neighbours,
+        not doubles.
         """
-        if not self.is_reversible:
+        if not self.is_reversible or self.counts is not None:
             return csr_array((self.num_nodes, self.num_nodes), dtype=bool)
-        alike = look_alikes(
-            self.hmm.emission_mean.detach().numpy(),
-            self.hmm.emission_scale.detach().numpy(),
-            self.config.power(self.hmm.obs_dim),
-        )
+        mean, scale, power = self._emissions()
+        alike = look_alikes(mean, scale, power)
         return csr_array(alike - alike.multiply(seen > 0) > 0)
+
+    def _twins(self) -> csr_array:
+        """Places that look the same, (N, N); none but in a map rebuilt by places."""
+        if self.counts is None or not self.is_reversible:
+            return csr_array((self.num_nodes, self.num_nodes), dtype=bool)
+        return places.find_twins(*self._emissions(), self.edges)
+
+    def _emissions(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Means and scales of the nodes, (N, D) each, and the power of their densities."""
+        mean, scale = self.hmm.emission_mean.detach(), self.hmm.emission_scale.detach()
+        return mean.numpy(), scale.numpy(), self.config.power(self.hmm.obs_dim)
 
     def _with_hops(self, transition: csr_array) -> csr_array:
         """Transitions, transposed, with which a belief may change over to a node's double."""
@@ -613,7 +638,8 @@ class Agent:
         likeliest = int(self.log_emission(normal).argmax())
         if self.strangeness(normal, likeliest) > 1.0:  # densities of strange sights say little
             likeliest = int(np.nanmean(np.abs(self._mean - normal), 1).argmin())
-        return np.array([likeliest])
+        twins = self.twins.indices[self.twins.indptr[likeliest] : self.twins.indptr[likeliest + 1]]
+        return np.append(likeliest, twins).astype(np.int64)
 
     def strangeness(self, normal: NDArray[np.float64], node: int) -> float:
         """How far an observation (D,) is from what a node looks like, in radii of a look.

@@ -40,6 +40,9 @@ LOST = 3
 FORGOTTEN = 0.01
 """Chance that between two tasks the robot was put at a place that looks the same."""
 
+MOST_JUMPS = 3
+"""Jumps of the belief in a task after which a robot goes back to where it can tell where it is."""
+
 LONGEST_DOUBT = 60
 """Steps in a row that the map is followed while many readings don't fit: about a moved wall's
 reach. A robot whose senses are wrong everywhere is lost after that."""
@@ -163,19 +166,28 @@ class BeliefExecutor:
         self._unfamiliar = self._weak = 0
         self._sensors = Sensors(agent.hmm.obs_dim)
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
-        self._cost_to_go = cost_to_go(self._cost, goals)
-        self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
-        self._next = -1
+        # A goal that is a sight is any place that looks like it.
+        self._can_be_unsure = sight is None and len(agent.telling) < agent.num_nodes
+        self._knows_where = not self._can_be_unsure
+        self._astray = self._jumps = 0
         self._from = -1
         self._steps_left = 0
-        self._best = np.inf
         self._failures = 0
         self._babble_left = 0
         self.status: Status = "running"
         self.node = -1
+        self._head_for(goals)
         self.belief = np.full(agent.num_nodes, 1.0 / agent.num_nodes)
         self.recovering = False
         self.reason = ""
+
+    def _head_for(self, targets: NDArray[np.int64]) -> None:
+        """Plan to the goals, or to where the robot can tell which of several places it is at."""
+        self._targets = targets
+        self._cost_to_go = cost_to_go(self._cost, targets)
+        self._distance = self._cost_to_go  # as the map has it, whatever is blamed later
+        self._best = np.inf if self.node < 0 else self._distance[self.node]
+        self._next = -1
 
     @property
     def path(self) -> list[int]:
@@ -183,7 +195,7 @@ class BeliefExecutor:
         if self.node < 0 or not np.isfinite(self._cost_to_go[self.node]):
             return []
         path = [self.node]
-        while path[-1] not in self._goals:
+        while path[-1] not in self._targets:
             path.append(self._cheapest_neighbor(path[-1]))
         return path
 
@@ -191,8 +203,9 @@ class BeliefExecutor:
         """Return the action of this control step, (A,), inside the action space."""
         normal = self._agent.normalize(observation)
         normal = self._recognize(normal)
-        is_lost = self._unfamiliar >= LOST
-        is_there = self.belief[self._goals].sum() > 0.5 and self._is_sure()
+        is_lost = self._unfamiliar >= LOST or self._astray > 0
+        is_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
+        is_there = is_there and self._trusts_sight()
         if self.status == "running" and is_there:
             if self._sight is None or self._sight_away(normal) <= 1 / LOOK_STEPS:
                 self.status = "reached"
@@ -212,6 +225,9 @@ class BeliefExecutor:
             self.status = "gave_up"
             self.reason = f"no node looks like anything seen in the last {LONGEST_SEARCH} steps"
         if self.status == "running":
+            targets = self._goals if self._knows_where else self._agent.telling
+            if targets is not self._targets:
+                self._head_for(targets)
             self._choose_next()
         if self.status != "running":
             return self._agent.rest_action
@@ -221,9 +237,30 @@ class BeliefExecutor:
             return self._search.act(normal)
         return self._agent.control(normal, self._next)
 
-    def _is_sure(self) -> bool:
+    def _trusts_sight(self) -> bool:
         """Whether this sight is familiar and not the first after many strange ones."""
         return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)
+
+    def _ask_where(self, before: int, is_plain: bool) -> None:
+        """Take note of whether the robot knows which of the places that look like this it is at.
+
+        It does once it was where no other place looks the same, and as long as it goes on from node
+        to node: a belief that jumps, jumps to what looks right. Until then no place is the goal.
+
+        Args:
+            before: node of the last step; -1 if there is none.
+            is_plain: what is seen is as likely as what the log saw at the node.
+        """
+        if not self._can_be_unsure:
+            return
+        is_telling = self.node in self._agent.telling
+        if is_telling and (is_plain or self._astray > LONGEST_DOUBT):
+            self._knows_where = True
+        elif before >= 0 and not self._agent.near[before, self.node] and self._knows_where:
+            self._jumps += 1
+            self._knows_where = self._jumps > MOST_JUMPS
+        # What looks wrong there is off the map, if it isn't the senses that are wrong.
+        self._astray = self._astray + 1 if is_telling and not self._knows_where else 0
 
     def _sight_away(self, normal: NDArray[np.float64]) -> float:
         """How far what the robot sees is from what it was told to look for, in radii of a look."""
@@ -235,14 +272,14 @@ class BeliefExecutor:
 
         Returns the readings that are believed; a frame without any leaves what was known.
         """
-        sensed = sensible(normal)
+        sensed, before = sensible(normal), self.node
         normal = self._sensors.working(sensed)
-        if self.node < 0:
+        if before < 0:
             self.belief = self._first_belief(normal)
         teleport = self._config.teleport
         pushed = self._agent.transition_in @ self.belief
         predicted = (1 - teleport) * pushed + teleport / len(pushed)
-        log_emission = self._agent.log_emission(normal)
+        log_emission = seen = self._agent.log_emission(normal)
         if not np.isnan(normal).all():
             normal, log_emission = self._doubt(normal, log_emission, predicted)
         log_belief = np.log(predicted) + log_emission
@@ -252,6 +289,7 @@ class BeliefExecutor:
         self.node = int(self.belief.argmax())
         if self.is_familiar:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
+        self._ask_where(before, bool(seen[self.node] >= self._agent.least_familiar))
         return normal
 
     def _doubt(
@@ -291,6 +329,7 @@ class BeliefExecutor:
         is_same = apart(seen, normal) <= self._agent.look_radius / LOOK_STEPS
         if not is_same or len(belief) != len(uniform):
             return uniform
+        self._knows_where = True
         return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform
 
     def watch(self, observation: NDArray[np.float32]) -> None:
@@ -311,7 +350,7 @@ class BeliefExecutor:
             return
         if self._distance[self.node] < self._best:
             self._best, self._failures = self._distance[self.node], 0
-        if self._next == self.node:
+        if self._next == self.node != self._from:
             self._scale_edge(1 / self._config.blame)
         is_pursued = self._next >= 0 and self._next != self.node
         if is_pursued and self._cost_to_go[self.node] > self._cost_to_go[self._next]:
@@ -324,9 +363,17 @@ class BeliefExecutor:
         if not np.isfinite(self._cost_to_go[self.node]):
             self._fail("no way is known from here")
             return
+        is_nearly_there = self.node in self._targets and self.is_familiar
+        if is_nearly_there and self._agent.is_reversible:  # else no node can be stayed at
+            if self._next != self.node:
+                self._steps_left = self._config.patience
+            self._from = self._next = self.node
+            self._steps_left -= 1
+            if self._steps_left >= 0:
+                return
         self._from, self._next = self.node, self._cheapest_neighbor(self.node)
         # No action leads from a node to its double: take it as done and head for what follows.
-        while self._agent.alike[self._from, self._next] and self._next not in self._goals:
+        while self._agent.alike[self._from, self._next] and self._next not in self._targets:
             self._from, self._next = self._next, self._cheapest_neighbor(self._next)
         self._steps_left = self._config.patience
 
@@ -345,7 +392,7 @@ class BeliefExecutor:
         cost = np.clip(self._cost.data[edge] * factor, base, BLAME_LIMIT * base)
         if cost != self._cost.data[edge]:
             self._cost.data[edge] = cost
-            self._cost_to_go = cost_to_go(self._cost, self._goals)
+            self._cost_to_go = cost_to_go(self._cost, self._targets)
 
     def _fail(self, reason: str) -> None:
         """Count a failure; the more in a row, the longer the search takes over."""

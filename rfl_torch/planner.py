@@ -47,8 +47,12 @@ def seen_edges(count: csr_array, is_reversible: bool) -> csr_array:
     return csr_array(cost + (UNTRIED if is_reversible else REVERSED) * untried)
 
 
-def look_alikes(mean: NDArray[np.float64], scale: NDArray[np.float64], power: float) -> csr_array:
+def look_alikes(
+    mean: NDArray[np.float64], scale: NDArray[np.float64], power: float, most: float = ALIKE
+) -> csr_array:
     """Pairs of nodes that their emissions can't tell apart, bool (N, N) without the diagonal.
+
+    Not by more than `most` nats, that is.
 
     A log laid out on a grid can run over one place on two sheets. The sheets' nodes look alike,
     and a robot that is at one is at the other. So are truly different places that look the same:
@@ -56,7 +60,7 @@ def look_alikes(mean: NDArray[np.float64], scale: NDArray[np.float64], power: fl
     """
     # No scale is above its reading's widest: pairs outside of this ball are told apart for sure.
     widest = np.sqrt(2.0) * scale.max(0)
-    radius = np.sqrt(ALIKE / (0.5 * power)) * (1 + 1e-9)
+    radius = np.sqrt(most / (0.5 * power)) * (1 + 1e-9)
     tree = cKDTree(mean / widest)
     count = int(tree.count_neighbors(tree, radius))
     if count > MOST_PAIRS:
@@ -69,7 +73,7 @@ def look_alikes(mean: NDArray[np.float64], scale: NDArray[np.float64], power: fl
     for start in range(0, len(pairs), PAIRS_AT_ONCE):
         i, j = pairs[start : start + PAIRS_AT_ONCE].T
         distance = (mean[i] - mean[j]) ** 2 / (scale[i] ** 2 + scale[j] ** 2)
-        is_alike[start : start + PAIRS_AT_ONCE] = 0.5 * power * distance.sum(1) < ALIKE
+        is_alike[start : start + PAIRS_AT_ONCE] = 0.5 * power * distance.sum(1) < most
     i, j = pairs[is_alike].T
     both = (np.concatenate([i, j]), np.concatenate([j, i]))
     return csr_array((np.ones(len(both[0]), bool), both), shape=(len(mean), len(mean)))

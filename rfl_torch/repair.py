@@ -5,7 +5,8 @@ different nodes. Yet a grid with too few nodes, or a fold in it, makes one node 
 that look different. Both are repaired from the log alone:
 
     look     observations within one radius of each other, by mean absolute difference
-    place    a set of nodes that the log goes to and fro between
+    place    where the log's track is (`places`); where actions don't add up to positions, a set of
+             nodes that the log goes to and fro between
     node     one look at one place
 
 The new nodes lie on no lattice: they are joined where the log went. Looks are compared by absolute
@@ -21,6 +22,7 @@ from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.spatial.distance import cdist
 
+from rfl_torch import places
 from rfl_torch.hmm import GridHMM
 from rfl_torch.innate import directions, nearest_direction
 
@@ -240,6 +242,24 @@ class Counts:
             self.first + other.first,
             self.second + other.second,
         )
+
+
+def tie(counts: Counts, power: float, min_scale: float) -> Counts:
+    """Give places that look exactly the same one and the same emission, and the same ways on.
+
+    They differ by where in the place the robot happened to be. Seen again and again, that would
+    make it ever surer of one of them.
+    """
+    weight = np.maximum(counts.weight, 1.0)
+    mean = counts.first / weight
+    scale = np.sqrt(np.maximum(counts.second / weight - mean**2, min_scale**2))
+    twins = places.find_twins(mean, scale, power, counts.edges)
+    twins = places.match_twins(twins, mean, scale, counts.edges)
+    pool = csr_array(twins + eye_array(counts.num_nodes))
+    edges = (pool @ counts.edges @ pool).multiply(places.within(counts.edges, places.NEAR))
+    return Counts(
+        csr_array(edges), *(pool @ x for x in (counts.weight, counts.first, counts.second))
+    )
 
 
 def rebuild(
