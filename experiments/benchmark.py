@@ -506,7 +506,7 @@ def make_agent(side: int, num_steps: int, seed: int) -> Agent:
     actions = np.diff(place, axis=0).astype(np.float32)
     bound = np.full(2, np.abs(actions).max(), np.float32)
     log = Trajectory(_see(place, rng), actions, action_low=-bound, action_high=bound)
-    agent = Agent(replace(AgentConfig(), shape=(side, side)), seed=seed)
+    agent = Agent(replace(AgentConfig(), shape=(side, side), repairs=False), seed=seed)
     nodes = (np.indices((side, side)).reshape(2, -1).T + 0.5) / side
 
     @torch.no_grad()
