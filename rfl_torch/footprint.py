@@ -11,7 +11,7 @@ from rfl_torch.inference import block_steps
 MEMINFO = Path("/proc/meminfo")
 """Where Linux says how much memory can be had."""
 
-PROGRAM = 150_000_000
+PROGRAM = 200_000_000
 """Bytes of the compiled code, and of much that is small."""
 
 ROWS, SAMPLES = 1_000, 16_000
