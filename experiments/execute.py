@@ -198,7 +198,10 @@ def best_trial(trials: Sequence[Trial]) -> Trial:
 
 
 def animate(path: Path, env: gym.Env, agent: Agent, trial: Trial, table: NodeTable) -> None:
-    """Do the task of the trial again, from the same start, and write an animation of it."""
+    """Do the task of the trial again, from the same start, and write an animation of it.
+
+    It may take another way: what later tasks found out counts by now.
+    """
     frames: list[figures.Frame] = []
     world, trace = scoring.world_of(env), trial.outcome.trace
     assert world is not None
@@ -210,7 +213,7 @@ def animate(path: Path, env: gym.Env, agent: Agent, trial: Trial, table: NodeTab
         executor,
         observation,
         info,
-        trial.outcome.num_steps,
+        world.limit,
         lambda executor, info: frames.append(
             figures.Frame(info["ground_truth"], executor.node, list(executor.path), executor.goal)
         ),
