@@ -1,8 +1,18 @@
-"""What tests of pages share: a real browser, where this machine has one."""
+"""What tests share: one thread, and a real browser where this machine has one."""
 
 import shutil
 
 import pytest
+import torch
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """The definition's small steps wait for a second thread longer than they take."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
 
 
 @pytest.fixture

@@ -21,13 +21,7 @@ COUNT_ATOL = 1e-5  # sums of those over 1,000 steps; seen: 1e-6
 COUNT_RTOL = 1e-6  # float32 partial sums over 256 steps; seen: 2.5e-7
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """The definition's small steps wait for a second thread longer than they take."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def random_hmm(shape, obs_dim, seed, *, scale=0.1, spread=2.0, drop=0.0, **graph):
