@@ -50,6 +50,10 @@ BATCH = 1024
 """Observations compared with all looks at a time."""
 
 
+LEAST_RADIUS = 1e-9
+"""Radius that is as good as none, yet can be divided by."""
+
+
 def look_radius(observations: list[Array], unit_actions: list[NDArray[np.float32]]) -> float:
     """Mean absolute change of a normalised observation over LOOK_STEPS full actions.
 
@@ -73,7 +77,8 @@ def look_radius(observations: list[Array], unit_actions: list[NDArray[np.float32
     middle = [np.median(x[is_near][part == k]) for k in range(10) if (part == k).any()]
     median = [np.median(y[is_near][part == k]) for k in range(10) if (part == k).any()]
     slope, offset = np.polyfit(middle, median, 1) if len(middle) > 1 else (0.0, float(median[0]))
-    return float(max(0.0, offset) + LOOK_STEPS * max(0.0, slope))
+    radius = max(0.0, offset) + LOOK_STEPS * max(0.0, slope)
+    return float(max(radius, LEAST_RADIUS))  # readings that hold still while actions go on have 0
 
 
 def find_looks(observations: Array, radius: float) -> Array:

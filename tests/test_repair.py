@@ -143,3 +143,9 @@ def test_inference_on_a_rebuilt_map_is_that_of_its_dense_transitions():
         for t in range(1, 200):
             alpha = (alpha[:, None] + log_a).logsumexp(0) + log_b[t]
     assert hmm.log_likelihood(value).item() == pytest.approx(alpha.logsumexp(0).item(), rel=1e-6)
+
+
+def test_readings_that_hold_still_leave_a_radius_to_divide_by():
+    still = np.zeros((100, 1))
+    radius = repair.look_radius([still], [np.ones((99, 1), np.float32)])
+    assert 0 < radius < 1e-6
