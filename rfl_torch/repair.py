@@ -58,7 +58,8 @@ def look_radius(observations: list[Array], unit_actions: list[NDArray[np.float32
     """Mean absolute change of a normalised observation over LOOK_STEPS full actions.
 
     A line is fitted to the changes over 1 to LONGEST_LAG steps against the length of the summed
-    actions: its slope is motion, its offset noise. A radius must hold both.
+    actions: its slope is motion, its offset noise. A radius must hold both. A log that mostly held
+    still, as a car at the end of its road does, is measured where it moved.
 
     Args:
         observations: (T+1, D) each, without missing readings.
@@ -72,13 +73,16 @@ def look_radius(observations: list[Array], unit_actions: list[NDArray[np.float32
             length.append(np.abs(total[lag:] - total[:-lag]).max(1))
     x, y = np.concatenate(length), np.concatenate(change)
     is_near = (x > 0) & (x <= 2 * LOOK_STEPS)
+    moves = is_near & (y > 0)
+    if 0 < moves.sum() < is_near.sum() / 2:
+        is_near = moves
     edges = np.quantile(x[is_near], np.linspace(0, 1, 11))
     part = np.digitize(x[is_near], edges[1:-1])
     middle = [np.median(x[is_near][part == k]) for k in range(10) if (part == k).any()]
     median = [np.median(y[is_near][part == k]) for k in range(10) if (part == k).any()]
     slope, offset = np.polyfit(middle, median, 1) if len(middle) > 1 else (0.0, float(median[0]))
     radius = max(0.0, offset) + LOOK_STEPS * max(0.0, slope)
-    return float(max(radius, LEAST_RADIUS))  # readings that hold still while actions go on have 0
+    return float(max(radius, LEAST_RADIUS))  # readings that never move have 0
 
 
 def find_looks(observations: Array, radius: float) -> Array:

@@ -149,3 +149,12 @@ def test_readings_that_hold_still_leave_a_radius_to_divide_by():
     still = np.zeros((100, 1))
     radius = repair.look_radius([still], [np.ones((99, 1), np.float32)])
     assert 0 < radius < 1e-6
+
+
+def test_a_look_is_as_wide_where_the_robot_stands_still_for_most_of_the_log():
+    rng = np.random.default_rng(0)
+    action = rng.random((4000, 1)).astype(np.float32)
+    move = (2 * action[:, 0] - 1) * (np.arange(4000) < 600)  # then it stands at the end of its road
+    seen = 0.01 * np.concatenate([[0.0], move.cumsum()])[:, None] * np.ones((1, 6))
+    radius = repair.look_radius([seen], [action])
+    assert radius == pytest.approx(0.01 * repair.LOOK_STEPS, rel=0.15)
