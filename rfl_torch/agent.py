@@ -36,6 +36,7 @@ from rfl_torch.controllers import (
 )
 from rfl_torch.executor import Executor, make_executor
 from rfl_torch.hmm import GridHMM, Statistics
+from rfl_torch.looks import BATCH, find_looks, look_radius
 from rfl_torch.motion import Memory, Motion, remember, remember_more
 from rfl_torch.online_svr import SVRBank
 from rfl_torch.planner import look_alikes, seen_edges
@@ -162,7 +163,7 @@ class Agent:
         learning.prune(self.hmm, observations, power)
         paths = self._recognize_logs(observations)
         actions = [self._unit_actions(log.actions) for log in logs]
-        self.look_radius = repair.look_radius(self._filled(observations, paths), actions)
+        self.look_radius = look_radius(self._filled(observations, paths), actions)
         loss = self._learn_controllers(observations, actions, paths)
         if config.repairs and self.is_reversible:
             paths = self._repair(observations, actions, paths)
@@ -261,7 +262,7 @@ class Agent:
             seen = np.where(np.isnan(observations), self._mean[rows.argmax(1)], observations)
             unknown = growth.log_unknown(rows, seen, self._mean, self.look_radius)
             path = growth.recognize(self.hmm, rows, unknown)
-            path = growth.add_looks(path, seen, self.look_radius, num_nodes)
+            path = growth.add_looks(path, seen, actions, self.look_radius, num_nodes)
             num_nodes = max(num_nodes, int(path.max()) + 1)
             more = repair.Counts.of([path], [observations], num_nodes)
             self.counts = self.counts.padded(num_nodes) + more
@@ -382,9 +383,7 @@ class Agent:
     ) -> list[Tensor]:
         """Rebuild the map by looks and places; returns the logs' paths on the new one."""
         seen = self._filled(observations, paths)
-        pooled = np.concatenate(seen)
-        pooled_looks, _ = repair.center_looks(pooled, repair.find_looks(pooled, self.look_radius))
-        looks = np.split(pooled_looks, np.cumsum([len(part) for part in seen])[:-1])
+        looks = find_looks(seen, actions, self.look_radius)
         by_grid = repair.split_by_place(looks, [path.numpy() for path in paths])
         most = MOST_PLACES * (1 + max(int(node.max()) for node in by_grid))
         by_track = places.split_by_track(looks, seen, actions, self.look_radius, most)
@@ -470,9 +469,7 @@ class Agent:
         hmm, power = self.hmm, self.config.power(self.hmm.obs_dim)
         parts = []
         with torch.no_grad():
-            for seen, node in zip(
-                observations.split(repair.BATCH), path.split(repair.BATCH), strict=True
-            ):
+            for seen, node in zip(observations.split(BATCH), path.split(BATCH), strict=True):
                 own = torch.distributions.Normal(hmm.emission_mean[node], hmm.emission_scale[node])
                 log_density = own.log_prob(seen.nan_to_num(0.0))
                 parts.append(power * log_density.masked_fill(seen.isnan(), 0.0).sum(1))

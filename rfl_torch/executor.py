@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from rfl_torch import inference
 from rfl_torch.innate import InnateController
+from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
-from rfl_torch.repair import LOOK_STEPS
 from rfl_torch.search import Search
 from rfl_torch.senses import FEW, Sensors, apart, believed, sensible
 from rfl_torch.steering import SteeringExecutor
