@@ -109,6 +109,9 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
     if "memory.node" in state:
         check_index("memory.node", state["memory.node"], num_nodes)
         check_index("memory.start", state["memory.start"], sizes["Q"])
+        begin = state["memory.start"].tolist()
+        if begin[:1] != [0] or begin != sorted(set(begin)):
+            raise ValueError("memory.start doesn't ascend from 0")
     if "bank.num_samples" in state:
         check_index("bank.num_samples", state["bank.num_samples"], sizes["S"] + 1)
     if sizes["2"] != 2:

@@ -23,6 +23,8 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from rfl_torch.memory import Memory, join
+
 Array = NDArray[np.float64]
 
 MAX_CHOICES = 9
@@ -74,34 +76,12 @@ FIT_BLOCK = 500
 """Landmarks fitted at once, for memory's sake."""
 
 
-class Memory(NamedTuple):
-    """The recognised logs that motion is learned from.
-
-    observation: float32 (M, E) normalised, all logs in a row.
-    action: float32 (M, A) in [0, 1]; the row at a log's last observation means nothing.
-    node: int64 (M,).
-    start: int64 (L,), where each log begins.
-    """
-
-    observation: NDArray[np.float32]
-    action: NDArray[np.float32]
-    node: NDArray[np.int64]
-    start: NDArray[np.int64]
-
-
 def remember(logs: list[tuple[Tensor, Tensor, Tensor]]) -> Memory | None:
     """Join recognised logs, each given as node (T+1,), observation (T+1, E) and action (T, A).
 
     None if they hold too few steps to learn motion from, or too many distinct actions.
     """
-    node, observation, action = zip(*logs, strict=True)
-    length = [len(path) for path in node]
-    memory = Memory(
-        np.concatenate([own.numpy() for own in observation]),
-        np.concatenate([np.concatenate([own.numpy(), own.numpy()[-1:]]) for own in action]),
-        np.concatenate([own.numpy() for own in node]),
-        np.cumsum([0, *length[:-1]]),
-    )
+    memory = join([(node.numpy(), seen.numpy(), action.numpy()) for node, seen, action in logs])
     if (
         len(_inner_rows(memory, held_steps(memory))) < MIN_SAMPLES
         or len(choices(memory.action)) > MAX_CHOICES
@@ -115,16 +95,8 @@ def remember_more(memory: Memory, node: Tensor, observation: Tensor, action: Ten
 
     One whose actions make too many choices is left out.
     """
-    last = action[-1:]
-    both = np.concatenate([memory.action, action.numpy()])
-    if len(choices(both)) > MAX_CHOICES:
-        return memory
-    return Memory(
-        np.concatenate([memory.observation, observation.numpy()]),
-        np.concatenate([memory.action, action.numpy(), last.numpy()]),
-        np.concatenate([memory.node, node.numpy()]),
-        np.append(memory.start, len(memory.node)),
-    )
+    longer = memory.plus(join([(node.numpy(), observation.numpy(), action.numpy())]))
+    return memory if len(choices(longer.action)) > MAX_CHOICES else longer
 
 
 def choices(action: NDArray[np.float32]) -> NDArray[np.float32]:

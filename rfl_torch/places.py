@@ -10,9 +10,12 @@ does, once the log has shown which change goes with which action.
     place      where the track is when a look is seen, give or take PLACE_STEPS
 
 This holds where an action leads as far, and the same way, from one place as from another. Where it
-doesn't, as for a robot that turns, the track never comes back to where it was; `split_by_track`
-then finds more places than it was told to believe.
+doesn't, as for a robot that turns, the track isn't where it was when a look is seen again: it
+doesn't come back.
 """
+
+from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +24,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, triu
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from rfl_torch.planner import look_alikes
 
@@ -58,33 +62,69 @@ SHIFT_ERROR, PLACE_WIDTH = 0.2, 2.0
 LOOSE = 1e-6
 """Weight of the track as followed, which holds what nothing else does."""
 
+MOST_DRIFT = 18.0
+"""Full actions that a track may be off when it comes back from where it never was: less than what
+lies between two rooms that look the same."""
 
-def split_by_track(
+OLD = 300
+"""Steps since a place was first come to, from which on it is old."""
+
+AGREED = 40
+"""Steps at looks with old places that must agree on how far the track is off before it is moved."""
+
+AWAY = 100
+"""Steps after which a look that is seen again is come back to."""
+
+COMES_BACK = 0.15
+"""How far a track is, when it comes back to a look, from the nearest place of that look, over how
+far any other step is: medians. In mazes it is 0.03 to 0.07, for pendulums and cars 0.6 to 1.6, and
+0.2 in rooms of ten by ten actions, where everything is near."""
+
+
+class Track(NamedTuple):
+    """Where each step of some logs was, by the moves between."""
+
+    looks: list[Labels]
+    """(T+1,) each, of every observation."""
+    shifts: list[Array]
+    """(T, A) each, in full actions."""
+    followed: list[Array]
+    """(T+1, A) each, in full actions."""
+    nodes: list[Labels]
+    """(T+1,) each: the places as they were come upon."""
+    num_places: int
+    comes_back: bool
+    """Whether a look that is seen again after long is seen where it was."""
+
+    def split(self) -> list[Labels]:
+        """Nodes, one for each look at each place of the relaxed track, int64 (T+1,) each."""
+        return _gather(self.looks, relax(self.nodes, self.shifts, self.followed))
+
+
+def follow_track(
     looks: list[Labels],
     observations: list[Array],
     unit_actions: list[NDArray[np.float32]],
     radius: float,
-    most: int,
-) -> list[Labels] | None:
-    """Nodes, one for each look at each place, int64 (T+1,) each; None if there are more than most.
+) -> Track:
+    """Sum up the moves of some logs, and pull them together where places recur.
 
     Args:
         looks: of every observation of each log.
         observations: (T+1, D) each, without missing readings.
         unit_actions: (T, A) each, in [0, 1].
         radius: of a look.
-        most: places that are believed.
     """
     shifts = find_shifts(looks, observations, unit_actions, radius)
     known = KnownPlaces(max(int(look.max()) for look in looks) + 1, shifts[0].shape[1])
-    tracks, nodes = [], []
-    for look, shift in zip(looks, shifts, strict=True):
-        track, node = known.follow(look, shift, known.find_start(look, shift))
-        if len(known.look) > most:
-            return None
-        tracks.append(track)
-        nodes.append(node)
-    return _gather(looks, relax(nodes, shifts, tracks))
+    parts = [
+        known.follow(look, shift, known.find_start(look, shift))
+        for look, shift in zip(looks, shifts, strict=True)
+    ]
+    tracks, nodes = (list(part) for part in zip(*parts, strict=True))
+    used, flat = np.unique(np.concatenate(nodes), return_inverse=True)  # some were moved away from
+    nodes = np.split(flat, _starts(nodes)[1:])
+    return Track(looks, shifts, tracks, nodes, len(used), known.comes_back())
 
 
 def find_shifts(
@@ -110,7 +150,7 @@ def find_shifts(
     for steps in np.split(look.argsort(kind="stable"), np.bincount(look).cumsum()[:-1]):
         if not len(steps):
             continue
-        away = np.abs(middle - np.median(middle[steps], 0)).mean(1)
+        away = cdist(np.median(middle[steps], 0)[None], middle, "cityblock")[0]
         near = away.argpartition(min(NEAREST, len(away)) - 1)[:NEAREST]
         product = change[near].T @ change[near]
         weight = RIDGE * max(product.trace(), 1e-12) * np.eye(len(product))
@@ -128,6 +168,10 @@ class KnownPlaces:
         self._of_look: list[list[int]] = [[] for _ in range(num_looks)]
         self._sum = np.zeros((64, dim))
         self._count = np.zeros(64)
+        self._born: list[int] = []
+        self._num_steps = 0
+        self._last = np.full(num_looks, -1)
+        self._returns: list[tuple[float, float]] = []
 
     @property
     def position(self) -> Array:
@@ -139,12 +183,49 @@ class KnownPlaces:
         """Go along a log from `start` (A,); returns its track (T+1, A) and its places (T+1,)."""
         track, node = np.empty((len(look), len(start))), np.empty(len(look), np.int64)
         here = start
+        missed: deque[tuple[int, Array]] = deque(maxlen=AGREED)
         for t in range(len(look)):
             if t > 0:
                 here = here + shift[t - 1]
-            node[t], here = self._visit(int(look[t]), here)
+            own = int(look[t])
+            if (off := self._off(own, here)) is not None:
+                if (drift := _agreed(missed)) is not None:
+                    here = here + drift
+                    for step, _ in missed:
+                        node[step], _ = self._visit(int(look[step]), track[step] + drift)
+                    missed.clear()
+                else:
+                    missed.append((t, off))
+            if self._last[own] >= 0 and self._num_steps - self._last[own] > AWAY:
+                self._returns.append((self._away(own, here), self._away(own, track[t // 2])))
+            self._last[own] = self._num_steps
+            self._num_steps += 1
+            node[t], here = self._visit(own, here)
             track[t] = here
         return track, node
+
+    def _off(self, look: int, here: Array) -> Array | None:
+        """From a position to the nearest old place of a look, (A,); None if none is near."""
+        places = [k for k in self._of_look[look] if self._num_steps - self._born[k] > OLD]
+        if not places:
+            return None
+        away = self._sum[places] / self._count[places, None] - here
+        length = np.linalg.norm(away, axis=1)
+        nearest = int(length.argmin())
+        return away[nearest] if length[nearest] < MOST_DRIFT else None
+
+    def comes_back(self) -> bool:
+        """Whether looks seen again after long were near their places, much nearer than others."""
+        if not self._returns:
+            return False
+        away, others = np.median(self._returns, axis=0)
+        return bool(away < COMES_BACK * others)
+
+    def _away(self, look: int, here: Array) -> float:
+        """Distance of a position from the nearest place of a look, which has one."""
+        places = self._of_look[look]
+        middle = self._sum[places] / self._count[places, None]
+        return float(np.linalg.norm(middle - here, axis=1).min())
 
     def _visit(self, look: int, here: Array) -> tuple[int, Array]:
         """The place of a look at a position, a new one if need be; and the position, corrected."""
@@ -159,6 +240,7 @@ class KnownPlaces:
         else:
             node = len(self.look)
             self.look.append(look)
+            self._born.append(self._num_steps)
             places.append(node)
             if node == len(self._count):
                 self._sum = np.concatenate([self._sum, np.zeros_like(self._sum)])
@@ -186,6 +268,16 @@ class KnownPlaces:
         near = cKDTree(offset).query_ball_point(offset, PLACE_STEPS / 2)
         best = near[int(np.argmax([vote[part].sum() for part in near]))]
         return np.average(offset[best], axis=0, weights=vote[best])
+
+
+def _agreed(missed: deque[tuple[int, Array]]) -> Array | None:
+    """How far a track is off by what the last steps missed, (A,); None if it isn't, or unclear."""
+    if len(missed) < AGREED:
+        return None
+    off = np.array([own for _, own in missed])
+    drift = np.median(off, 0)
+    is_alike = np.linalg.norm(off - drift, axis=1) < PLACE_STEPS / 2
+    return drift if np.linalg.norm(drift) > PLACE_STEPS and is_alike.mean() > 0.8 else None
 
 
 def relax(nodes: list[Labels], shifts: list[Array], tracks: list[Array]) -> list[Array]:

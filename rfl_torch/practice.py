@@ -29,6 +29,10 @@ Strategy = Literal["random", "least_visited", "frontier", "progress"]
 LEARN_EVERY = 500
 """Steps between two updates of what is known."""
 
+LEARN_SHARE = 0.05
+"""Where all logs are laid out anew, which takes the longer the more there are: steps between two
+updates at least, as a share of all so far."""
+
 LONGEST_WAY = 400
 """Steps after which a goal is let go."""
 
@@ -77,10 +81,11 @@ class Goals:
 
     def update(self) -> None:
         """Take note of what the agent learned since."""
-        more = self._agent.num_nodes - len(self.fast)
-        self.fast = np.append(self.fast, np.full(more, 0.5))
-        self.slow = np.append(self.slow, np.full(more, 0.0))  # new nodes promise progress
-        self.failures = np.append(self.failures, np.zeros(more))
+        num_nodes, kept = self._agent.num_nodes, slice(self._agent.num_nodes)
+        more = max(0, num_nodes - len(self.fast))
+        self.fast = np.append(self.fast[kept], np.full(more, 0.5))
+        self.slow = np.append(self.slow[kept], np.full(more, 0.0))  # new nodes promise progress
+        self.failures = np.append(self.failures[kept], np.zeros(more))
         self.untried = untried(self._agent)
 
     def choose(self, node: int) -> int:
@@ -207,12 +212,20 @@ def practice(
         attempt = Attempt(begin, goal, on_way, reached, agent.num_nodes, unknown / max(1, on_way))
         history.append(attempt)
         _report(monitor, strategy, history, run.done)
-        if run.pending >= LEARN_EVERY or run.left == 0:
+        if run.pending >= _pace(agent) or run.left == 0:
             agent.partial_fit(run.take_logs(*agent.action_bounds))
             goals.update()
+            assert agent.last_seen is not None
+            node = int(agent.last_seen[1].argmax())  # it may have another number now
         for _ in range(run.done - begin):
             next(bar, None)
     return history
+
+
+def _pace(agent: "Agent") -> float:
+    """Steps until the agent should learn."""
+    num_known = 0 if not agent.has_track else agent.edges.sum()
+    return max(LEARN_EVERY, LEARN_SHARE * float(num_known))
 
 
 def _look_around(

@@ -93,6 +93,26 @@ def number_anew(nodes: list[Labels]) -> tuple[list[Labels], int]:
     return np.split(flat, np.cumsum([len(path) for path in nodes])[:-1]), len(used)
 
 
+def keep_numbers(nodes: Labels, before: Labels) -> Labels:
+    """Number nodes (M,) such that each has the number of the old node it shares most steps with.
+
+    Numbers stay without gaps: those of old nodes that are gone go to new ones.
+
+    Args:
+        nodes: of all steps, numbered without gaps.
+        before: old nodes of the first of these steps.
+    """
+    num_nodes = int(nodes.max()) + 1
+    shared = csr_array((np.ones(len(before)), (nodes[: len(before)], before))).tocoo()
+    number, taken = np.full(num_nodes, -1), np.zeros(num_nodes, bool)
+    for k in np.argsort(-shared.data, kind="stable"):
+        node, old = shared.row[k], shared.col[k]
+        if old < num_nodes and number[node] < 0 and not taken[old]:
+            number[node], taken[old] = old, True
+    number[number < 0] = np.flatnonzero(~taken)
+    return np.asarray(number[nodes])
+
+
 def count_directions(
     paths: list[Labels], unit_actions: list[NDArray[np.float32]], num_nodes: int
 ) -> Array:

@@ -165,3 +165,12 @@ def test_fitting_again_forgets_what_was_learned_before():
     assert (again.statistics is None) == (fresh.statistics is None)
     for name, value in fresh.hmm.state_dict().items():
         assert (value == again.hmm.state_dict()[name]).all(), name
+
+
+def test_a_map_of_fewer_nodes_forgets_what_was_blamed_on_those_that_are_gone(half_agent):
+    agent = Agent.load(half_agent)
+    last = agent.graph.indptr[-2]
+    agent.graph.data[[0, last]] *= 9.0
+    blamed = agent.blamed()
+    agent._blame_again([*blamed, (agent.num_nodes, 0, 9.0)])
+    assert agent.blamed() == blamed

@@ -11,9 +11,9 @@ from worlds import dot_config, dot_log
 
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory
 from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
+from rfl_torch.memory import Memory
 from rfl_torch.motion import (
     HORIZON,
-    Memory,
     Motion,
     apart,
     choices,

@@ -7,11 +7,13 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory, places, record, repair
+from rfl_torch.checkpoint import load_checkpoint
 from rfl_torch.looks import find_looks, look_radius
 
 PLAN = {
@@ -29,6 +31,10 @@ PLAN = {
 """A corridor with two bays that look the same from inside."""
 
 
+STAGES = (Stage(3, 60, (0.01, 1.0), pseudo_count=0.01, min_scale=0.05, tolerance=0.0),)
+SMALL = AgentConfig(shape=(12, 12), stages=STAGES)
+
+
 class Walk(NamedTuple):
     """A log in the maze, and what it is taken apart from."""
 
@@ -44,8 +50,11 @@ class Walk(NamedTuple):
         actions = np.split((self.log.actions + 1) / 2, cuts)
         return looks, seen, [row[: len(look) - 1] for row, look in zip(actions, looks, strict=True)]
 
-    def nodes(self, num=1, most=10_000):
-        return np.concatenate(places.split_by_track(*self.parts(num), self.radius, most))
+    def track(self, num=1):
+        return places.follow_track(*self.parts(num), self.radius)
+
+    def nodes(self, num=1):
+        return np.concatenate(self.track(num).split())
 
     def extent(self, node):
         """Largest distance [mm] between two steps of each node, along x or y."""
@@ -54,9 +63,9 @@ class Walk(NamedTuple):
         )
 
 
-def walk_in(layout, num_steps):
+def walk_in(layout, num_steps, seed=0):
     with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
-        log = record(env, num_steps, hold=10, seed=0)
+        log = record(env, num_steps, hold=10, seed=seed)
     low = log.observations.min(0)
     seen = ((log.observations - low) / np.ptp(log.observations, axis=0)).astype(np.float64)
     actions = [(log.actions + 1) / 2]
@@ -115,17 +124,37 @@ def test_logs_that_begin_anywhere_are_laid_on_one_another(walk):
     assert len(np.unique(node)) < 1.1 * len(np.unique(walk.nodes()))
 
 
-def test_a_track_that_never_comes_back_is_not_believed():
-    """Of a robot that goes round and round one way: each time around is farther on."""
+def test_a_track_comes_back_where_actions_add_up(walk):
+    assert walk.track().comes_back
+    looks, seen, actions = walk.parts(1)
+    order = np.random.default_rng(0).permutation(len(actions[0]))
+    assert not places.follow_track(looks, seen, [actions[0][order]], walk.radius).comes_back
+
+
+def test_a_robot_that_only_goes_round_never_comes_back():
+    """Each time around is farther on."""
     rng = np.random.default_rng(0)
     action = 0.5 + 0.5 * rng.random((2999, 1))
     angle = np.concatenate([[0.0], (0.1 * (2 * action[:, 0] - 1)).cumsum()])
     look = np.floor(angle % (2 * np.pi) / (2 * np.pi) * 20).astype(np.int64)
     seen = np.stack([np.cos(angle), np.sin(angle)], 1)
-    log = ([look], [seen], [action])
-    (node,) = places.split_by_track(*log, radius=0.2, most=10_000)
-    assert len(np.unique(node)) > 300
-    assert places.split_by_track(*log, radius=0.2, most=40) is None
+    track = places.follow_track([look], [seen], [action], radius=0.2)
+    assert track.num_places > 300
+    assert not track.comes_back
+
+
+def test_a_track_that_drifted_off_the_map_is_moved_back_once_known_looks_agree():
+    """To and fro on a line, once beyond what is known: there the track goes 12 too far."""
+    known = [*range(60), *range(60, 0, -1)]
+    look = np.array([*known * 3, *range(90), *range(90, 0, -1), *known])
+    shift = np.diff(look).astype(np.float64)[:, None]
+    straight, _ = places.KnownPlaces(91, 1).follow(look, shift, np.zeros(1))
+    shift[360 + 75] += 12.0
+    track, node = places.KnownPlaces(91, 1).follow(look, shift, np.zeros(1))
+    assert (node[-120:] == node[:120]).all()
+    back = slice(360 + 90 + 31, 360 + 180)  # from where it is on the map again
+    assert (node[back] == node[59:0:-1][: 180 - 90 - 31]).all()
+    assert np.abs(track[-120:] - straight[-120:]).max() < 4
 
 
 def test_relaxed_tracks_are_the_least_squares():
@@ -220,10 +249,100 @@ def test_tied_twins_have_one_emission_and_the_same_ways_on():
     np.testing.assert_array_equal(tied.first[4:6], counts.first[4:6])
 
 
+@pytest.fixture(scope="module")
+def late(plan):
+    """A walk that enters the second bay late, and when."""
+    walk = walk_in(plan, 5000, seed=2)
+    truth = walk.log.ground_truth
+    step = int(((truth[:, 1] > 200) & (truth[:, 0] > 300)).argmax())
+    assert 2000 < step < 4000
+    return walk, step
+
+
+@pytest.fixture(scope="module")
+def half_path(late, tmp_path_factory):
+    """Learned from that walk up to there."""
+    walk, step = late
+    path = tmp_path_factory.mktemp("places") / "half.safetensors"
+    Agent(SMALL).fit(part(walk.log, 0, step)).save(path)
+    return path
+
+
+def part(log, begin, end):
+    bounds, truth = log.bounds, log.ground_truth[begin : end + 1]
+    return Trajectory(log.observations[begin : end + 1], log.actions[begin:end], *bounds, truth)
+
+
+def test_a_room_entered_later_is_not_taken_for_one_that_looks_the_same(late, half_path):
+    """The rest of the walk comes in pieces of 500 steps, most of which begin inside a bay."""
+    (walk, step), agent = late, Agent.load(half_path)
+    assert agent.has_track
+    while step < walk.log.num_steps:
+        piece = part(walk.log, step, min(step + 500, walk.log.num_steps))
+        agent.partial_fit(piece)
+        step += piece.num_steps
+        seen, belief = agent.last_seen
+        assert belief.argmax() == agent.memory.node[-1]
+        np.testing.assert_array_equal(seen, agent.normalize(piece.observations[-1]))
+    assert len(agent.memory.start) == 1
+    assert agent.edges.sum() == walk.log.num_steps
+    assert walk.extent(agent.memory.node).max() < 120
+    assert walk.extent(agent.recognize(walk.log.observations)).max() < 120
+    whole = Agent(SMALL).fit(walk.log)
+    assert agent.num_nodes < 1.15 * whole.num_nodes
+
+
+def test_an_agent_that_was_saved_between_lays_out_the_same(late, half_path, tmp_path):
+    (walk, step), whole = late, Agent.load(half_path)
+    whole.partial_fit(part(walk.log, step, step + 200))
+    whole.save(tmp_path / "between.safetensors")
+    again = Agent.load(tmp_path / "between.safetensors")
+    for agent in (whole, again):
+        agent.partial_fit(part(walk.log, step + 200, step + 400))
+    whole.save(tmp_path / "whole.safetensors")
+    again.save(tmp_path / "again.safetensors")
+    first, second = (load_checkpoint(tmp_path / f"{x}.safetensors")[1] for x in ("whole", "again"))
+    assert first.keys() == second.keys()
+    assert all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+def test_practice_is_one_log_that_goes_on(plan, late, half_path):
+    agent = Agent.load(half_path)
+    before = agent.edges.sum()
+    with gym.make("rfl/RangefinderMaze-v0", layout=plan) as env:
+        agent.practice(env, 1100)
+    assert len(agent.memory.start) == 2  # the log learned from, and what came after the reset
+    assert len(agent.memory.node) == before + 1 + 1100 + 1
+    assert agent.edges.sum() == before + 1100
+    assert agent.last_seen[1].argmax() == agent.memory.node[-1]
+
+
+def test_nodes_keep_their_numbers_and_places_when_more_is_learned(late, half_path):
+    (walk, step), agent = late, Agent.load(half_path)
+    before = agent.memory.node
+    agent.partial_fit(part(walk.log, step, step + 500))
+    after, truth = agent.memory.node[: len(before)], walk.log.ground_truth[: len(before)]
+    assert (after == before).mean() > 0.75  # the others lie at a border that has moved
+    moved = [
+        np.linalg.norm(truth[after == k].mean(0) - truth[before == k].mean(0))
+        for k in np.intersect1d(before, after)
+    ]
+    assert np.quantile(moved, 0.9) < 20  # mm: half of a node
+
+
+def test_a_goal_is_where_the_log_saw_what_is_most_like_it(late, half_path):
+    (walk, _), agent = late, Agent.load(half_path)
+    seen = agent.memory.observation
+    for step in range(0, len(seen), 97):
+        goals = agent._goal_nodes(walk.log.observations[step])
+        assert goals[0] == agent.memory.node[step]
+        away = np.abs(seen - seen[step]).mean(1) / agent.look_radius
+        assert set(goals) == set(agent.memory.node[away <= 0.1])
+
+
 def test_a_robot_put_into_one_of_two_rooms_goes_to_see_which_it_is(plan, walk):
     """Started in one bay and sent to the same or another place in either."""
-    stages = (Stage(3, 60, (0.01, 1.0), pseudo_count=0.01, min_scale=0.05, tolerance=0.0),)
-    agent = Agent(AgentConfig(shape=(12, 12), stages=stages)).fit(walk.log)
+    agent = Agent(SMALL).fit(walk.log)
     path = agent.recognize(walk.log.observations)
     truth = walk.log.ground_truth
     place = np.array([truth[path == k].mean(0) for k in range(agent.num_nodes)])

@@ -113,3 +113,23 @@ def test_inference_on_a_rebuilt_map_is_that_of_its_dense_transitions():
         for t in range(1, 200):
             alpha = (alpha[:, None] + log_a).logsumexp(0) + log_b[t]
     assert hmm.log_likelihood(value).item() == pytest.approx(alpha.logsumexp(0).item(), rel=1e-6)
+
+
+def test_nodes_keep_the_number_of_the_old_node_that_they_share_most_steps_with():
+    before = np.array([0, 0, 0, 1, 1, 2, 2, 3])
+    nodes = np.array([2, 2, 0, 0, 0, 4, 4, 4, 1, 3])  # 3 has joined 2; 1 and 3 are new
+    assert repair.keep_numbers(nodes, before).tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 3, 4]
+    rng = np.random.default_rng(0)
+    before = rng.integers(20, size=300)
+    shuffled = rng.permutation(20)[before]
+    assert (repair.keep_numbers(shuffled, before) == before).all()
+
+
+def test_numbers_have_no_gaps_when_nodes_are_gone():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        before, nodes = rng.integers(12, size=50), rng.integers(8, size=60)
+        found = repair.keep_numbers(np.unique(nodes, return_inverse=True)[1], before)
+        num_nodes = len(np.unique(nodes))
+        assert set(found) == set(range(num_nodes))
+        assert len({*zip(found.tolist(), nodes.tolist(), strict=True)}) == num_nodes

@@ -1,0 +1,69 @@
+"""Recognised logs, kept in a row where learning more goes back to them.
+
+Motion is learned from them where a world can't run backwards (`motion`). Where actions add up to
+positions, all of them are laid out anew together with what comes next (`places`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Memory(NamedTuple):
+    """The recognised logs that are learned from.
+
+    observation: float32 (M, E) normalised, all logs in a row, without gaps.
+    action: float32 (M, A) in [0, 1]; the row at a log's last observation means nothing.
+    node: int64 (M,).
+    start: int64 (L,), where each log begins.
+    """
+
+    observation: NDArray[np.float32]
+    action: NDArray[np.float32]
+    node: NDArray[np.int64]
+    start: NDArray[np.int64]
+
+    def logs(self) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]]]:
+        """Observations (T+1, E) and actions (T, A) of each log."""
+        cuts = self.start[1:]
+        seen = np.split(self.observation.astype(np.float64), cuts)
+        return seen, [action[:-1] for action in np.split(self.action, cuts)]
+
+    def paths(self) -> list[NDArray[np.int64]]:
+        """Nodes (T+1,) of each log."""
+        return np.split(self.node, self.start[1:])
+
+    def ends_with(self, observation: NDArray[np.float64]) -> bool:
+        """Whether the readings (E,) that are there are those of the last step."""
+        is_there = ~np.isnan(observation)
+        is_same = observation.astype(np.float32) == self.observation[-1]
+        return bool(is_there.any() and is_same[is_there].all())
+
+    def plus(self, more: "Memory", goes_on: bool = False) -> "Memory":
+        """This memory with another's logs behind.
+
+        Args:
+            more: other logs.
+            goes_on: its first log is what became of the last one, from that one's last step.
+        """
+        end = len(self.node) - goes_on
+        start = np.append(self.start, more.start[int(goes_on) :] + end)
+        return Memory(
+            np.concatenate([self.observation[:end], more.observation]),
+            np.concatenate([self.action[:end], more.action]),
+            np.concatenate([self.node[:end], more.node]),
+            start,
+        )
+
+
+def join(
+    logs: list[tuple[NDArray[np.int64], NDArray[np.floating], NDArray[np.float32]]],
+) -> Memory:
+    """Put logs in a row, each given as node (T+1,), observation (T+1, E) and action (T, A)."""
+    return Memory(
+        np.concatenate([seen for _, seen, _ in logs], dtype=np.float32, casting="same_kind"),
+        np.concatenate([np.concatenate([action, action[-1:]]) for *_, action in logs]),
+        np.concatenate([node for node, *_ in logs]),
+        np.cumsum([0, *(len(node) for node, *_ in logs[:-1])]),
+    )
