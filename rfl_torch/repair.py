@@ -210,6 +210,12 @@ def rebuild(
     joined = csr_array(edges + pseudo_count * (edges.astype(bool) + eye_array(num_nodes)))
     if is_reversible:
         joined = csr_array(joined + pseudo_count * edges.T.astype(bool))
+    ends = np.asarray(joined.sum(1) == 0).ravel()  # come to by the last step of all, and once
+    if ends.any():
+        joined = csr_array(
+            joined
+            + csr_array((ends.astype(np.float64), np.arange(num_nodes), np.arange(num_nodes + 1)))
+        )
     # The recursions lay the graph out by diagonals: few, if neighbours have near numbers.
     order = reverse_cuthill_mckee(csr_array(joined), symmetric_mode=is_reversible)
     cell = np.empty(num_nodes, np.int64)

@@ -133,3 +133,13 @@ def test_numbers_have_no_gaps_when_nodes_are_gone():
         num_nodes = len(np.unique(nodes))
         assert set(found) == set(range(num_nodes))
         assert len({*zip(found.tolist(), nodes.tolist(), strict=True)}) == num_nodes
+
+
+def test_a_node_that_only_the_last_step_came_to_can_be_stayed_at():
+    path = np.array([0, 1, 0, 1, 2])
+    counts = repair.Counts.of([path], [np.eye(3)[path]], 3)
+    hmm = GridHMM((2, 2), 3)
+    repair.rebuild(hmm, counts, False, 0.3, 0.0)
+    transition = hmm.transition_matrix().detach().numpy()
+    np.testing.assert_allclose(transition.sum(1), 1.0)
+    assert transition[2, 2] == pytest.approx(1.0)
