@@ -127,11 +127,6 @@ class Control(nn.Module):
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
-        if agent.observation_period.any() or agent.motion is not None:
-            raise ValueError(
-                "this agent chooses actions by looking ahead; there is no network that answers for "
-                "it. Leave --controllers out, and let the robot's loop call the agent's executor."
-            )
         used = np.flatnonzero(agent.observation_scale > 0)
         low, high = agent.action_bounds
         buffers = {
@@ -162,8 +157,13 @@ def export_controllers(agent: Agent) -> torch.export.ExportedProgram:
     """Return the controllers as a program.
 
     Raises:
-        ValueError: if torch can't export this kind of controllers.
+        ValueError: if the agent doesn't act by controllers, or torch can't export this kind.
     """
+    if agent.observation_period.any() or agent.motion is not None:
+        raise ValueError(
+            "this agent chooses actions by looking ahead; there is no network that answers for "
+            "it. Leave --controllers out, and let the robot's loop call the agent's executor."
+        )
     observation = torch.zeros(len(agent.observation_low))
     try:
         with torch.no_grad():

@@ -36,6 +36,7 @@ from rfl_torch.controllers import (
 )
 from rfl_torch.executor import Executor, make_executor
 from rfl_torch.hmm import GridHMM, Statistics
+from rfl_torch.looks import BATCH, find_looks, look_radius
 from rfl_torch.memory import Memory, join
 from rfl_torch.motion import Motion, remember, remember_more
 from rfl_torch.online_svr import SVRBank
@@ -170,7 +171,7 @@ class Agent:
         paths = self._recognize_logs(observations)
         actions = [self._unit_actions(log.actions) for log in logs]
         seen = self._filled(observations, paths)
-        self.look_radius = repair.look_radius(seen, actions)
+        self.look_radius = look_radius(seen, actions)
         track = (
             self._follow_track(seen, actions) if config.repairs and config.uses_reversal else None
         )
@@ -332,7 +333,7 @@ class Agent:
             seen = np.where(np.isnan(observations), self._mean[rows.argmax(1)], observations)
             unknown = growth.log_unknown(rows, seen, self._mean, self.look_radius)
             path = growth.recognize(self.hmm, rows, unknown)
-            path = growth.add_looks(path, seen, self.look_radius, num_nodes)
+            path = growth.add_looks(path, seen, actions, self.look_radius, num_nodes)
             num_nodes = max(num_nodes, int(path.max()) + 1)
             more = repair.Counts.of([path], [observations], num_nodes)
             self.counts = self.counts.padded(num_nodes) + more
@@ -451,9 +452,7 @@ class Agent:
         self, seen: list[NDArray[np.float64]], actions: list[NDArray[np.float32]]
     ) -> places.Track:
         """Where logs without gaps went, and what looks they saw there."""
-        pooled = np.concatenate(seen)
-        pooled_looks, _ = repair.center_looks(pooled, repair.find_looks(pooled, self.look_radius))
-        looks = np.split(pooled_looks, np.cumsum([len(part) for part in seen])[:-1])
+        looks = find_looks(seen, actions, self.look_radius)
         return places.follow_track(looks, seen, actions, self.look_radius)
 
     def _repair(
@@ -561,9 +560,7 @@ class Agent:
         hmm, power = self.hmm, self.config.power(self.hmm.obs_dim)
         parts = []
         with torch.no_grad():
-            for seen, node in zip(
-                observations.split(repair.BATCH), path.split(repair.BATCH), strict=True
-            ):
+            for seen, node in zip(observations.split(BATCH), path.split(BATCH), strict=True):
                 own = torch.distributions.Normal(hmm.emission_mean[node], hmm.emission_scale[node])
                 log_density = own.log_prob(seen.nan_to_num(0.0))
                 parts.append(power * log_density.masked_fill(seen.isnan(), 0.0).sum(1))

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from rfl_torch import inference
 from rfl_torch.innate import InnateController
+from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
-from rfl_torch.repair import LOOK_STEPS
 from rfl_torch.search import Search
 from rfl_torch.senses import FEW, Sensors, apart, believed, sensible
 from rfl_torch.steering import SteeringExecutor
@@ -53,6 +53,10 @@ To a robot whose senses are wrong everywhere, one in a hundred looks familiar, b
 
 LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
+
+CONFIRMED = 10
+"""Familiar steps in a row without a jump after which a belief that jumped is trusted: a wall that
+moved makes one room look like another for some steps."""
 
 APPROACH = 20
 """Steps from a goal's node to the goal's own sight, to within a full action of it; then a sight
@@ -170,6 +174,7 @@ class BeliefExecutor:
         self._can_be_unsure = sight is None and len(agent.telling) < agent.num_nodes
         self._knows_where = not self._can_be_unsure
         self._astray = self._jumps = 0
+        self._confirmed = CONFIRMED
         self._from = -1
         self._steps_left = 0
         self._failures = 0
@@ -238,7 +243,9 @@ class BeliefExecutor:
         return self._agent.control(normal, self._next)
 
     def _trusts_sight(self) -> bool:
-        """Whether this sight is familiar and not the first after many strange ones."""
+        """Whether this sight is familiar and not the first after many strange ones, or a jump."""
+        if self._confirmed < CONFIRMED:
+            return False
         return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)
 
     def _ask_where(self, before: int, is_plain: bool) -> None:
@@ -289,6 +296,10 @@ class BeliefExecutor:
         self.node = int(self.belief.argmax())
         if self.is_familiar:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
+        if before >= 0 and not self._agent.near[before, self.node]:
+            self._confirmed = 0
+        elif self._confirmed < CONFIRMED:
+            self._confirmed = self._confirmed + 1 if self.is_familiar else 0
         self._ask_where(before, bool(seen[self.node] >= self._agent.least_familiar))
         return normal
 

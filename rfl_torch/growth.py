@@ -8,8 +8,8 @@ model: a jump from anywhere to anywhere, by which new edges are found, and a sta
 import numpy as np
 from numpy.typing import NDArray
 
-from rfl_torch import repair
 from rfl_torch.hmm import GridHMM
+from rfl_torch.looks import BATCH, distance, find_looks
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -43,8 +43,8 @@ def log_unknown(log_emission: Array, observations: Array, mean: Array, radius: f
     """
     away = np.concatenate(
         [
-            repair.distance(observations[begin : begin + repair.BATCH], mean).min(1)
-            for begin in range(0, len(observations), repair.BATCH)
+            distance(observations[begin : begin + BATCH], mean).min(1)
+            for begin in range(0, len(observations), BATCH)
         ]
     )
     return log_emission.max(1) + np.where(away > radius, STRANGE, FAMILIAR)
@@ -101,20 +101,24 @@ def _predecessors(hmm: GridHMM) -> tuple[NDArray[np.int64], Array]:
     return table, value
 
 
-def add_looks(path: Labels, observations: Array, radius: float, num_nodes: int) -> Labels:
+def add_looks(
+    path: Labels,
+    observations: Array,
+    unit_actions: NDArray[np.float32],
+    radius: float,
+    num_nodes: int,
+) -> Labels:
     """Give the unknown steps of a path new nodes, from `num_nodes` on; one for each look.
 
     Args:
         path: from `recognize`.
         observations: normalised, without missing readings, (T, D).
-        radius: of a look.
+        unit_actions: between them, in [0, 1], (T-1, A).
+        radius: see `looks.look_radius`.
         num_nodes: nodes that exist.
     """
     steps = np.flatnonzero(path == UNKNOWN)
-    if not len(steps):
-        return path
-    seen = observations[steps]
-    look, _ = repair.center_looks(seen, repair.find_looks(seen, radius))
+    (look,) = find_looks([observations], [unit_actions], radius)
     path = path.copy()
-    path[steps] = num_nodes + look
+    path[steps] = num_nodes + np.unique(look[steps], return_inverse=True)[1].ravel()
     return path

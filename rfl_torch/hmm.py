@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.special import log_softmax
 from torch import Tensor, nn
 
-from rfl_torch import inference
+from rfl_torch import inference, kernels
 from rfl_torch.grid import Boundary, Metric, build_grid
 
 MIN_WEIGHT = 1e-8
@@ -96,17 +95,12 @@ class Sample(NamedTuple):
     observations: Tensor
 
 
-# Torch wakes its threads for an exp or a log of any size, and they spin in the E-step's way. These,
-# and `log_softmax` in `chain`, stay on the calling thread; they know no gradient.
+def _array(x: Tensor) -> np.ndarray:
+    """The numbers as the kernels take them, float64 and contiguous.
 
-
-def _exp(x: Tensor) -> Tensor:
-    return torch.from_numpy(np.exp(x.detach().numpy()))
-
-
-def _log(x: Tensor) -> Tensor:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return torch.from_numpy(np.log(x.detach().numpy()))
+    No exp or log is torch's: it wakes its threads for them, which spin in the E-step's way.
+    """
+    return np.ascontiguousarray(x.detach().numpy(), np.float64)
 
 
 class GridHMM(nn.Module):
@@ -222,17 +216,18 @@ class GridHMM(nn.Module):
     @torch.no_grad()
     def chain(self, temperature: float = 1.0) -> inference.Chain:
         """The parameters laid out for `inference`; emissions raised to `temperature`."""
-        logits = np.where(
-            self.successor_mask.numpy(), self.transition_logits.double().numpy(), -np.inf
-        )
+        logits = _array(self.initial_logits)
+        initial = logits - logits.max()
+        initial -= np.log(np.exp(initial).sum())
         return inference.build_chain(
             self._diagonals,
-            np.maximum(log_softmax(logits, 1), MIN_LOG_PROB),
-            np.maximum(log_softmax(self.initial_logits.double().numpy()), MIN_LOG_PROB),
-            self.emission_mean.double().numpy(),
-            _exp(self.emission_log_scale).double().numpy(),
+            np.where(self.successor_mask.numpy(), _array(self.transition_logits), -np.inf),
+            np.maximum(initial, MIN_LOG_PROB),
+            _array(self.emission_mean),
+            _array(self.emission_log_scale),
             self.cell.numpy(),
             self.num_cells,
+            MIN_LOG_PROB,
             temperature,
         )
 
@@ -287,27 +282,24 @@ class GridHMM(nn.Module):
         unknown = fixed - {name for name, _ in self.named_parameters()}
         if unknown:
             raise ValueError(f"`fixed` names {sorted(unknown)}, which the model does not have.")
-        if "initial_logits" not in fixed:
-            prob = statistics.initial / statistics.initial.sum()
-            self.initial_logits.copy_(_log(prob).clamp(min=MIN_LOG_PROB))
-        if "transition_logits" not in fixed:
-            counts = (statistics.edge + pseudo_count) * self.successor_mask
-            total = counts.sum(1, keepdim=True)
-            log_prob = _log(counts / total).clamp(min=MIN_LOG_PROB)
-            known = (total > MIN_WEIGHT) & self.successor_mask
-            self.transition_logits.copy_(torch.where(known, log_prob, self.transition_logits))
-        known = statistics.weight > MIN_WEIGHT
-        weight = torch.where(known, statistics.weight, 1.0)
-        mean = statistics.first / weight
-        variance = (statistics.second / weight - mean**2).clamp(min=min_scale**2)
-        mean = (1 - trace) * mean + trace * self.emission_mean
-        variance = (1 - trace) * variance + trace * _exp(self.emission_log_scale) ** 2
-        variance = variance.clamp(min=min_scale**2)
-        if "emission_mean" not in fixed:
-            self.emission_mean.copy_(torch.where(known, mean, self.emission_mean))
-        if "emission_log_scale" not in fixed:
-            log_scale = 0.5 * _log(variance)
-            self.emission_log_scale.copy_(torch.where(known, log_scale, self.emission_log_scale))
+        new = {name: _array(value).copy() for name, value in self.named_parameters()}
+        with np.errstate(divide="ignore"):
+            log_prob = np.log(_array(statistics.initial) / _array(statistics.initial).sum())
+        new["initial_logits"] = np.maximum(log_prob, MIN_LOG_PROB)
+        kernels.best_edges(
+            _array(statistics.edge), self.successor_mask.numpy(), pseudo_count, MIN_WEIGHT,
+            MIN_LOG_PROB, new["transition_logits"],
+        )  # fmt: skip
+        weight, log_scale = _array(statistics.weight), new["emission_log_scale"]
+        variance = np.empty_like(log_scale)
+        kernels.best_gaussians(
+            weight, _array(statistics.first), _array(statistics.second),
+            trace, min_scale**2, MIN_WEIGHT, new["emission_mean"], log_scale, variance,
+        )  # fmt: skip
+        np.copyto(log_scale, 0.5 * np.log(variance), where=weight > MIN_WEIGHT)
+        for name, parameter in self.named_parameters():
+            if name not in fixed:
+                parameter.copy_(torch.from_numpy(new[name]))
 
     def log_likelihood(self, observations: Sequences) -> Tensor:
         """Natural log of the observations' density, () [nat], summed over steps and sequences."""

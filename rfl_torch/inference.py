@@ -8,9 +8,11 @@ block when it is crossed, so memory grows with T / BLOCK, not with T.
 Symbols as in `kernels`; equation numbers are the paper's.
 """
 
+import functools
+import math
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
@@ -21,13 +23,16 @@ from rfl_torch.simd import LANES, aligned_empty, aligned_full
 
 BLOCK = 50_000
 """Steps whose messages are held at once by each of the two threads, 16 bytes a node; of longer
-halves all but the last block are run twice, which takes half as long again."""
+halves the steps before these are run twice, which takes half as long again."""
 
 _CACHE_BLOCK = 512
 """Steps that are worked on at once where nothing is kept of them."""
 
 _MAX_ENTRIES = 20_000_000
 """Steps times cells that a block holds at most, whatever BLOCK says; an entry takes 16 bytes."""
+
+_SEGMENT_CELLS = 1 << 19
+"""Steps times cells that are run twice at once, few enough to stay in a cache."""
 
 _SHORT = 200_000
 """Steps times cells of a sequence that one thread does sooner than two: starting one has a price,
@@ -105,43 +110,44 @@ def _whole_tiles(num_cells: int) -> int:
 
 def build_chain(
     diagonals: Diagonals,
-    log_transition: np.ndarray,
+    transition_logits: np.ndarray,
     initial_log: np.ndarray,
     mean: np.ndarray,
-    scale: np.ndarray,
+    log_scale: np.ndarray,
     cell: np.ndarray,
     num_cells: int,
+    lowest: float,
     temperature: float = 1.0,
 ) -> Chain:
-    """Lay the parameters of N nodes out over the lattice; log_transition (N, K), mean (N, D)."""
+    """Lay the parameters of N nodes out over the lattice, all float64.
+
+    transition_logits (N, K), -inf where there is no edge; initial_log (N,) [nat]; mean, log_scale
+    (N, D); lowest: floor of the edges' log-probabilities [nat].
+    """
     num_cells = _whole_tiles(num_cells)
     shape = (len(diagonals.shift), num_cells)
-    log_weight = log_transition.ravel()[diagonals.slot]
+    weight_in, weight_out = (aligned_full(shape, 0.0, np.float32) for _ in range(2))
+    in_exponent, out_exponent = (aligned_full(shape, kernels.ABSENT, np.int32) for _ in range(2))
     log_weight_in = aligned_full(shape, -np.inf, np.float64)
-    log_weight_in.ravel()[diagonals.entering] = log_weight
-    log2_weight = log_weight * (1.0 / np.log(2.0))
-    exponent = np.floor(log2_weight)
-    mantissa = np.exp2(log2_weight - exponent)
-    tables = []
-    for place in (diagonals.entering, diagonals.leaving):
-        weight = aligned_full(shape, 0.0, np.float32)
-        weight_exponent = aligned_full(shape, kernels.ABSENT, np.int32)
-        weight.ravel()[place] = mantissa
-        weight_exponent.ravel()[place] = exponent
-        tables += [weight, weight_exponent]
+    logits = transition_logits - transition_logits.max(1, keepdims=True)
+    tables = (weight_in, in_exponent, weight_out, out_exponent, log_weight_in)
+    kernels.lay_out_edges(
+        logits, np.exp(logits), lowest, diagonals.slot, diagonals.entering, diagonals.leaving,
+        *(table.ravel() for table in tables),
+    )  # fmt: skip
     inverse_scale, scaled_mean, log_norm = (
         aligned_full((mean.shape[1], num_cells), 0.0, np.float64) for _ in range(3)
     )
-    inverse_scale[:, cell] = (1.0 / scale).T
-    scaled_mean[:, cell] = (mean / scale).T
-    log_norm[:, cell] = (-0.5 * np.log(2 * np.pi) - np.log(scale)).T
+    kernels.lay_out_gaussians(
+        mean, log_scale, np.exp(-log_scale), cell, inverse_scale, scaled_mean, log_norm
+    )
     initial = np.full(num_cells, -np.inf)
     initial[cell] = initial_log
     is_node = np.zeros(num_cells, bool)
     is_node[cell] = True
     return Chain(
-        (num_cells - diagonals.shift) % num_cells, tables[0], tables[1],
-        diagonals.shift, tables[2], tables[3],
+        (num_cells - diagonals.shift) % num_cells, weight_in, in_exponent,
+        diagonals.shift, weight_out, out_exponent,
         inverse_scale, scaled_mean, log_norm,
         initial, np.where(is_node, 0.0, -np.inf), log_weight_in, cell, is_node,
         num_cells, temperature,
@@ -213,14 +219,16 @@ class _Message:
             if is_forward
             else (chain.shift_out, chain.weight_out, chain.weight_out_exponent)
         )
-        self.last = (
-            aligned_full((2 * chain.num_cells,), 0.0, np.float32),
-            aligned_full((2 * chain.num_cells,), 0, np.int32),
-        )
+        room = aligned_empty((8 * chain.num_cells,), np.int32)
+        mantissa, exponent = room[: 4 * chain.num_cells], room[4 * chain.num_cells :]
+        self.last = mantissa.view(np.float32), exponent, np.zeros(1, np.int32)
         self.normalizer = np.zeros(2)
 
     def advance(self, block: slice, rows: Rows) -> float:
-        """Run the message through one block, from where it stands; returns the log base [nat]."""
+        """Run the message through one block, from where it stands; returns the log base [nat].
+
+        With fewer rows than steps, none is kept.
+        """
         observations, log_base = self.observations[block], 0.0
         if self.is_forward and block.start == 0:
             log_base = self._begin(observations[:1], rows.part(slice(0, 1)))
@@ -238,61 +246,101 @@ class _Message:
 
     def _begin(self, observation: np.ndarray, row: Rows) -> float:
         """Write alpha_1 = pi b_1 (eq. 2), or b_T beta_T with beta_T = 1 (eq. 4); returns a base."""
-        base = np.empty(1)
-        kernels.emission_rows(observation, *_gaussians(self.chain), row.b, row.b_exponent, base)
-        start = self.chain.initial_log if self.is_forward else self.chain.log_node
-        with np.errstate(divide="ignore"):
-            log_row = np.log(row.b, dtype=np.float64) + row.b_exponent * np.log(2.0) + start
-        base += kernels.split_row(log_row, row.mantissa, row.exponent)
-        self.last[0][:] = np.tile(row.mantissa[0], 2)
-        self.last[1][:] = np.tile(row.exponent[0], 2)
-        return float(base[0])
+        log_row = log_emission(self.chain, observation)
+        kernels.split_row(log_row, row.b, row.b_exponent)
+        log_row += self.chain.initial_log if self.is_forward else self.chain.log_node
+        log_base = kernels.split_row(log_row, row.mantissa, row.exponent)
+        self.set_state((row.mantissa[0], row.exponent[0], np.zeros(1, np.int32)))
+        return log_base
+
+    def state(self) -> tuple[np.ndarray, ...]:
+        """A copy of where the message stands, for `set_state`."""
+        num_cells = self.chain.num_cells
+        return self.last[0][:num_cells].copy(), self.last[1][:num_cells].copy(), self.last[2].copy()
+
+    def set_state(self, state: tuple[np.ndarray, ...]) -> None:
+        """Go on from a `state`."""
+        num_cells = self.chain.num_cells
+        for message, row in zip(self.last[:2], state[:2], strict=True):
+            message[:num_cells] = message[num_cells : 2 * num_cells] = row
+        self.last[2][:] = state[2]
 
     def meet(self, other: Rows) -> float:
         """Begin to cross, at a row (1, G) of the other message; log2 of the two's joint sum."""
         kernels.joint_sum(
-            *self.last, other.mantissa, other.exponent, *self.edges, self.normalizer
+            *self.last[:2], other.mantissa, other.exponent, *self.edges, self.normalizer
         )  # fmt: skip
         if self.normalizer[0] == 0.0:  # the two halves share no live node
             raise ValueError(_UNREACHABLE)
         return float(np.log2(self.normalizer[0]) + self.normalizer[1])
 
-    def cross(self, other: Rows, counts: np.ndarray, counts_first_step: bool) -> np.ndarray:
+    def cross(
+        self, other: Rows, counts: np.ndarray, counts_first_step: bool, moments: "_Moments | None"
+    ) -> None:
         """Push the message across steps whose other message is known; see `crossing_rows`.
 
-        Returns gamma (T, G), which takes the place of the other message's mantissas.
+        gamma (T, G) takes the place of the other message's mantissas, and is added to `moments`.
         """
-        kernels.crossing_rows(
-            *self.last, other.b, other.b_exponent, other.mantissa, other.exponent, other.base,
-            *self.edges, self.normalizer, other.mantissa, counts, counts_first_step,
-            not self.is_forward,
-        )  # fmt: skip
+        stored = (other.b, other.b_exponent, other.mantissa, other.exponent, other.base)
+        state = (*self.last, *stored, *self.edges, self.normalizer)
+        if moments is None:
+            kernels.crossing_rows(
+                *state, other.mantissa, counts, counts_first_step, not self.is_forward
+            )
+        else:
+            kernels.crossing_sums(*state, counts, counts_first_step, not self.is_forward, *moments)
         if not 0.0 < self.normalizer[0] < np.inf:  # the messages part within the steps
             raise ValueError(_UNREACHABLE)
-        return other.mantissa
+
+
+class _Moments(NamedTuple):
+    """What `kernels.add_moments` asks for besides gamma: some steps, and where to add them."""
+
+    observations: np.ndarray
+    center: np.ndarray
+    with_gaps: bool
+    sums: np.ndarray
 
 
 class _Half:
-    """A message over its own half of the sequence, of which one block is held at a time."""
+    """A message over its own half of the sequence, of which the steps nearest the middle are held.
 
-    def __init__(self, message: _Message, steps: slice, rows: Rows) -> None:
-        self.message, self.rows = message, rows
+    The others are run in segments of which only the start is kept, and run once more when crossed.
+    """
+
+    def __init__(self, message: _Message, steps: slice, rows: Rows, num_held: int) -> None:
+        self.message = message
+        self.rows, self.segment_rows = rows.part(slice(num_held)), rows.part(slice(num_held, None))
         self.starts: list[tuple[slice, tuple[np.ndarray, ...]]] = []
         self.log_base = 0.0
-        for block in _blocks(steps, len(rows.b), from_end=not message.is_forward):
-            self.starts.append((block, tuple(array.copy() for array in message.last)))
-            self.log_base += message.advance(block, rows.part(slice(0, block.stop - block.start)))
+        num_far = max(0, steps.stop - steps.start - num_held)
+        if message.is_forward:
+            far = slice(steps.start, steps.start + num_far)
+            self.held = slice(far.stop, steps.stop)
+        else:
+            far = slice(steps.stop - num_far, steps.stop)
+            self.held = slice(steps.start, far.start)
+        size = max(1, len(self.segment_rows.b))
+        overwritten = self.segment_rows.part(slice(kernels.cached_steps(message.chain.num_cells)))
+        for segment in _blocks(far, size, from_end=not message.is_forward):
+            self.starts.append((segment, message.state()))
+            self.log_base += message.advance(segment, _first(overwritten, segment))
+        self.log_base += message.advance(self.held, _first(self.rows, self.held))
 
-    def from_middle(self) -> Iterator[slice]:
-        """Yield the blocks, the one nearest the middle first; earlier ones are run once more."""
-        block, _ = self.starts.pop()
-        yield block
+    def from_middle(self) -> Iterator[tuple[slice, Rows]]:
+        """Yield the held steps and then the segments, each with its rows, away from the middle."""
+        yield self.held, _first(self.rows, self.held)
         again = _Message(self.message.chain, self.message.observations, self.message.is_forward)
-        for block, last in reversed(self.starts):
-            for array, start in zip(again.last, last, strict=True):
-                array[:] = start
-            again.advance(block, self.rows.part(slice(0, block.stop - block.start)))
-            yield block
+        for segment, state in reversed(self.starts):
+            again.set_state(state)
+            rows = _first(self.segment_rows, segment)
+            again.advance(segment, rows)
+            yield segment, rows
+
+
+def _first(rows: Rows, steps: slice) -> Rows:
+    """As many of the rows as there are steps."""
+    return rows.part(slice(0, steps.stop - steps.start))
 
 
 class Expectations(NamedTuple):
@@ -318,24 +366,28 @@ def expectations(chain: Chain, diagonals: Diagonals, observations: np.ndarray) -
     center, has_gaps = _center(observations)
     num_features = 1 + (3 if has_gaps else 2) * obs_dim
     sums = np.zeros((2, num_features, chain.num_cells))  # of either half, so by its own thread
+    if len(observations) == 1:
+        gamma, log_likelihood = filter_rows(chain, observations)
+        kernels.add_moments(gamma, observations, center, has_gaps, sums[0])
+        edge, initial = np.zeros((2, *chain.weight_in.shape)), gamma[0]
+    else:
 
-    def gather(half: int, steps: slice, smoothed: np.ndarray) -> None:
-        kernels.add_moments(smoothed, observations[steps], center, has_gaps, sums[half])
+        def cross(message, steps, rows, counts, is_counted):  # type: ignore[no-untyped-def]
+            own = sums[int(message.is_forward)]
+            moments = _Moments(observations[steps], center, has_gaps, own)
+            message.cross(rows, counts, is_counted, moments)
 
-    edge, initial, log_likelihood = _meet_in_the_middle(chain, observations, gather)
-    total = sums.sum(0)[:, chain.cell].T
-    node = total[:, 0]
-    first, second = total[:, 1 : obs_dim + 1], total[:, obs_dim + 1 : 2 * obs_dim + 1]
-    weight = np.repeat(node[:, None], obs_dim, 1)
-    if has_gaps:
-        weight = weight - total[:, 2 * obs_dim + 1 :]
+        edge, initial, log_likelihood = _meet_in_the_middle(chain, observations, cross)
+    node = np.empty(len(chain.cell))
+    weight, first, second = (np.empty((len(node), obs_dim)) for _ in range(3))
+    kernels.expected_moments(sums, chain.cell, center, has_gaps, node, weight, first, second)
     return Expectations(
         initial[chain.cell],
         node,
         edge[0].ravel()[diagonals.entering] + edge[1].ravel()[diagonals.leaving],
         weight,
-        first + weight * center,
-        second + 2 * center * first + weight * center**2,
+        first,
+        second,
         log_likelihood,
     )
 
@@ -351,50 +403,52 @@ def _center(observations: np.ndarray) -> tuple[np.ndarray, bool]:
 
 def smooth(chain: Chain, observations: np.ndarray) -> np.ndarray:
     """p(node at t | all observations), float32 (T, N)."""
+    if len(observations) == 1:
+        return filter_rows(chain, observations)[0][:, chain.cell]
     out = np.empty((len(observations), len(chain.cell)), np.float32)
 
-    def keep(half: int, steps: slice, smoothed: np.ndarray) -> None:
-        out[steps] = smoothed[:, chain.cell]
+    def cross(message, steps, rows, counts, is_counted):  # type: ignore[no-untyped-def]
+        message.cross(rows, counts, is_counted, None)
+        out[steps] = rows.mantissa[:, chain.cell]
 
-    _meet_in_the_middle(chain, observations, keep)
+    _meet_in_the_middle(chain, observations, cross)
     return out
 
 
-Visit = Callable[[int, slice, np.ndarray], None]
-"""Called with a half (0 or 1), some of its steps and their gamma, each half on its own thread."""
+Cross = Callable[[_Message, slice, Rows, np.ndarray, bool], None]
+"""Carries a message across some steps, whose rows and expected counts it is given, and whether the
+first of them counts: `_Message.cross`. Each half is crossed on its own thread."""
 
 
 def _meet_in_the_middle(  # type: ignore[no-untyped-def]
-    chain: Chain, observations: np.ndarray, visit: Visit
+    chain: Chain, observations: np.ndarray, cross: Cross
 ):
-    """Form gamma over the whole sequence, a few steps at a time, on two threads.
+    """Form gamma over a sequence of two steps at least, some steps at a time, on two threads.
 
     Returns expected counts by target and by source cell, (2, O, G); gamma_1; the log-likelihood.
     """
-    num_steps, shape = len(observations), chain.weight_in.shape
-    is_alone = num_steps * chain.num_cells < _SHORT or _num_cores() == 1
-    if num_steps == 1:
-        gamma, log_likelihood = filter_rows(chain, observations)
-        visit(0, slice(0, 1), gamma)
-        return np.zeros((2, *shape)), gamma[0], log_likelihood
+    num_steps, num_cells = len(observations), chain.num_cells
+    is_alone = num_steps * num_cells < _SHORT or _num_cores() == 1
     middle = num_steps // 2
-    block = min(block_steps(chain.num_cells), num_steps - middle)
+    num_held = min(block_steps(num_cells), num_steps - middle)
+    num_twice = num_steps - middle - num_held
+    num_rows = num_held + min(segment_steps(num_twice, num_cells), num_twice)
     forward, backward = (_Message(chain, observations, ahead) for ahead in (True, False))
     with (
-        _borrow_rows(block, chain.num_cells) as past_rows,
-        _borrow_rows(block, chain.num_cells) as future_rows,
+        _borrow_rows(num_rows, num_cells) as past_rows,
+        _borrow_rows(num_rows, num_cells) as future_rows,
     ):
         past, future = _both(
             is_alone,
             _Half,
-            (forward, slice(0, middle), past_rows),
-            (backward, slice(middle, num_steps), future_rows),
+            (forward, slice(0, middle), past_rows, num_held),
+            (backward, slice(middle, num_steps), future_rows, num_held),
         )
         (edge_in, _, log2_joint), (edge_out, initial, _) = _both(
-            is_alone, _cross_half, (forward, future, visit), (backward, past, visit)
+            is_alone, _cross_half, (forward, future, cross), (backward, past, cross)
         )
     log_likelihood = log2_joint * np.log(2.0) + past.log_base + future.log_base
-    return np.stack([edge_in, edge_out]), initial, log_likelihood
+    return (edge_in, edge_out), initial, log_likelihood
 
 
 def _both(  # type: ignore[no-untyped-def]
@@ -403,9 +457,22 @@ def _both(  # type: ignore[no-untyped-def]
     """Do two pieces of work, at once unless `is_alone`; returns both results."""
     if is_alone:
         return work(*first), work(*second)
-    with ThreadPoolExecutor(1) as pool:
-        other = pool.submit(work, *second)
-        return work(*first), other.result()
+    other = _helper().submit(work, *second)
+    try:
+        own = work(*first)
+    finally:
+        wait([other])  # it writes to what the caller is about to give back
+    return own, other.result()
+
+
+@functools.cache
+def _helper() -> ThreadPoolExecutor:
+    """The second thread, kept: starting one takes as long as a hundred steps."""
+    return ThreadPoolExecutor(1, "rfl_torch")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helper.cache_clear)  # threads do not outlive a fork
 
 
 def _num_cores() -> int:
@@ -415,20 +482,18 @@ def _num_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _cross_half(message: _Message, half: _Half, visit: Visit):  # type: ignore[no-untyped-def]
-    """Carry `message` across the half that the other thread has stored."""
+def _cross_half(message: _Message, half: _Half, cross: Cross):  # type: ignore[no-untyped-def]
+    """Carry `message` across the half that the other thread has run over."""
     counts = np.zeros(message.chain.weight_in.shape)
-    smoothed, log2_joint = half.rows.mantissa, None
-    for block in half.from_middle():
-        rows = half.rows.part(slice(0, block.stop - block.start))
+    log2_joint = None
+    for steps, rows in half.from_middle():
         # Both messages take the step over the middle; the forward one counts it.
         is_counted = message.is_forward or log2_joint is not None
         if log2_joint is None:
             nearest = slice(0, 1) if message.is_forward else slice(-1, None)
             log2_joint = message.meet(rows.part(nearest))
-        smoothed = message.cross(rows, counts, is_counted)
-        visit(int(message.is_forward), block, smoothed)
-    return counts, smoothed[0].astype(np.float64), log2_joint
+        cross(message, steps, rows, counts, is_counted)
+    return counts, rows.mantissa[0].astype(np.float64), log2_joint
 
 
 def filter_rows(chain: Chain, observations: np.ndarray) -> tuple[np.ndarray, float]:
@@ -553,6 +618,11 @@ def most_likely_path(chain: Chain, observations: np.ndarray) -> np.ndarray:
 def block_steps(num_cells: int) -> int:
     """Steps whose messages or choices are held at once."""
     return max(1, min(BLOCK, _MAX_ENTRIES // num_cells))
+
+
+def segment_steps(num_steps: int, num_cells: int) -> int:
+    """Steps that are run twice at once: so many that neither their rows nor the starts are many."""
+    return max(math.isqrt(num_steps), _SEGMENT_CELLS // num_cells)
 
 
 def _first_score(chain: Chain, observations: np.ndarray) -> np.ndarray:

@@ -31,6 +31,7 @@ from rfl_torch.simd import (
     as_bits,
     as_float,
     broadcast,
+    get,
     greater,
     largest,
     load,
@@ -38,6 +39,8 @@ from rfl_torch.simd import (
     maximum,
     narrow,
     prefetch,
+    put,
+    registers,
     round_down,
     store,
     to_int,
@@ -51,18 +54,27 @@ ABSENT = -(1 << 28)
 NEGLIGIBLE = 2.0**-100
 """Posterior below which a cell is left out of a step's sums: they lose at most T times this."""
 
-CACHED_STEPS = 512
-"""Steps whose emissions are evaluated before the message runs over them."""
+EDGES = 13
+"""Diagonals whose summands stay in registers: those of a square grid of the paper's radius, pruned
+or not. Any other number of them takes longer for each."""
+
+CACHED_CELLS = 32_768
+"""Steps times cells that are worked on at once: 16 bytes each, which a core's own cache holds."""
+
+MIN_CACHED_STEPS = 64
+"""Steps that are worked on at once however wide they are, so that what is done once a part pays."""
 
 _FLAGS = {"contract", "nsz", "arcp"}  # never nnan/ninf: infinities and NaN keep their meaning
 
 _LN_2 = math.log(2.0)
 _LOG2_E = 1.0 / _LN_2
+_HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 _ABSENT, _NOTHING = np.int32(ABSENT), np.int32(2 * ABSENT)  # int32: a Python int would widen
 _ZERO, _ONE, _NEGLIGIBLE = np.float32(0.0), np.float32(1.0), np.float32(NEGLIGIBLE)
 _SMALLEST, _BIAS, _SHIFT = np.int32(1), np.int32(127), np.int32(23)  # of a float32's exponent
 _FAINT = np.int32(127 - 116)  # a gamma of this exponent is under NEGLIGIBLE and set to zero:
 # denormal numbers would cost more than all the rest of the step
+_FRACTION_64, _ONE_64 = np.int64((1 << 52) - 1), np.int64(1023 << 52)  # of a float64
 _FRACTION, _EXPONENT = np.int32(0x7FFFFF), np.int32(0xFF)
 _TAYLOR = tuple(np.float32(1.0 / math.factorial(n)) for n in range(7, 1, -1))
 
@@ -240,23 +252,41 @@ def _split_row(log_rows, row, mantissa, exponent, t):  # type: ignore[no-untyped
 
 
 @njit(forceinline=True)
-def _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving):  # type: ignore[no-untyped-def]
+def _gather(  # type: ignore[no-untyped-def]
+    mantissa, exponent, first, shift, weight, weight_exponent, c, arriving
+):
     """Sum over the edges of a tile: sum_o weight[o, c] * message[c + shift[o]] = total * 2**top.
 
-    mantissa, exponent: (2 G,), the message written twice so that a shifted read is contiguous.
+    mantissa, exponent: (2 G,), the message written twice so that a shifted read is contiguous; cell
+        c stands at `first`.
     arriving: int32 (O * LANES,), scratch for the summands' exponents.
     """
     num_shifts, num_cells = weight.shape
-    top = broadcast(_NOTHING)
+    top, total = broadcast(_NOTHING), broadcast(_ZERO)
     for o in range(num_shifts):
-        own = load(exponent, load_one(shift, o) + c) + load(weight_exponent, o * num_cells + c)
+        own = load(exponent, load_one(shift, o) + first) + load(weight_exponent, o * num_cells + c)
         store(own, arriving, o * LANES)
         top = maximum(own, top)
-    total, bottom = broadcast(_ZERO), top - _BIAS
+    bottom = top - _BIAS
     for o in range(num_shifts):
-        scale = _power_of_two(load(arriving, o * LANES) - bottom)
-        product = load(mantissa, load_one(shift, o) + c) * load(weight, o * num_cells + c)
-        total += product * scale
+        product = load(mantissa, load_one(shift, o) + first) * load(weight, o * num_cells + c)
+        total += product * _power_of_two(load(arriving, o * LANES) - bottom)
+    return top, total
+
+
+@njit(forceinline=True)
+def _gather_edges(mantissa, exponent, first, shift, weight, weight_exponent, c, held):  # type: ignore[no-untyped-def]
+    """Do as `_gather` for EDGES diagonals, with the exponents `held` in registers."""
+    num_cells = weight.shape[1]
+    top, total = broadcast(_NOTHING), broadcast(_ZERO)
+    for o in range(EDGES):
+        own = load(exponent, load_one(shift, o) + first) + load(weight_exponent, o * num_cells + c)
+        put(held, o, own)
+        top = maximum(own, top)
+    bottom = top - _BIAS
+    for o in range(EDGES):
+        product = load(mantissa, load_one(shift, o) + first) * load(weight, o * num_cells + c)
+        total += product * _power_of_two(get(held, o) - bottom)
     return top, total
 
 
@@ -273,83 +303,124 @@ def _normalize(product, exponent):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _rebase(mantissa, exponent, base, row, row_exponent, first):  # type: ignore[no-untyped-def]
+def _rebase(mantissa, exponent, base, row, row_exponent):  # type: ignore[no-untyped-def]
     """Bring a row's largest exponent to 0, and lay it out twice as the next step's message."""
     num_cells = len(mantissa) // 2
     for c in range(0, num_cells, LANES):
-        value = load(row, first + c)
-        own = maximum(load(row_exponent, first + c) - base, broadcast(_ABSENT))
-        store(own, row_exponent, first + c)
-        store(value, mantissa, c)
-        store(value, mantissa, num_cells + c)
-        store(own, exponent, c)
-        store(own, exponent, num_cells + c)
+        own = maximum(load(row_exponent, c) - base, broadcast(_ABSENT))
+        store(own, row_exponent, c)
+        _store_twice(load(row, c), mantissa, c, num_cells)
+        _store_twice(own, exponent, c, num_cells)
+
+
+@njit(forceinline=True)
+def _store_twice(value, message, i, num_cells):  # type: ignore[no-untyped-def]
+    """Write a tile of a message to both of its copies."""
+    store(value, message, i)
+    store(value, message, i + num_cells)
+
+
+@njit
+def _leave_first(mantissa, exponent, now):  # type: ignore[no-untyped-def]
+    """Move the message that stands at `now`, 0 or the middle, to the beginning."""
+    for i in range(0, now, LANES):
+        store(load(mantissa, now + i), mantissa, i)
+        store(load(exponent, now + i), exponent, i)
 
 
 @njit(nogil=True, cache=True)
 def message_rows(  # type: ignore[no-untyped-def]
-    mantissa, exponent, b, b_exponent, shift, weight, weight_exponent,
-    row, row_exponent, base, backward,
+    mantissa, exponent, top, b, b_exponent, shift, weight, weight_exponent,
+    row, row_exponent, base, backward, is_kept,
 ):  # fmt: skip
-    """Run b_t(j) * sum_i a_ij * message over a block, storing every row and its base.
+    """Run b_t(j) * sum_i a_ij * message over a block; store every base and, if `is_kept`, each row.
 
     Forward (eq. 3): `weight` by destination. Backward (eq. 5): `weight` by source, last row first,
     and the rows are b_t beta_t, the message that eq. 5 sums.
-    mantissa, exponent (2 G,): the message before the block; on return, after it.
+    mantissa, exponent (4 G,), top int32 (1,): the message before the block, in their first half,
+        and its largest exponent, which becomes the base of the first step; on return, after it.
     Returns False if some step has no mass at all.
     """
     num_steps, num_cells = row.shape
-    arriving = aligned_row(len(shift) * LANES, _ABSENT)
+    arriving, held = aligned_row(len(shift) * LANES, _ABSENT), registers(EDGES, _ABSENT)
+    now, then = 0, 2 * num_cells  # a step reads one message and writes the other
     ahead = -num_cells if backward else num_cells
     for k in range(num_steps):
         t = num_steps - 1 - k if backward else k
-        top_of_row = broadcast(_NOTHING)
+        top_of_row, below = broadcast(_NOTHING), top[0]
         for c in range(0, num_cells, LANES):
             i = t * num_cells + c
-            prefetch(b, i + ahead)  # the machine does not expect a stream that runs backwards
-            prefetch(b_exponent, i + ahead)
-            top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
-            value, own = _normalize(total * load(b, i), top + load(b_exponent, i))
-            store(value, row, i)
-            store(own, row_exponent, i)
+            if is_kept:  # the machine does not expect a stream that runs backwards
+                prefetch(row, i + ahead)
+                prefetch(row_exponent, i + ahead)
+            if len(shift) == EDGES:
+                highest, total = _gather_edges(
+                    mantissa, exponent, now + c, shift, weight, weight_exponent, c, held
+                )
+            else:
+                highest, total = _gather(
+                    mantissa, exponent, now + c, shift, weight, weight_exponent, c, arriving
+                )
+            value, own = _normalize(total * load(b, i), highest + load(b_exponent, i) - below)
+            own = maximum(own, broadcast(_ABSENT))
+            if is_kept:
+                store(value, row, i)
+                store(own, row_exponent, i)
+            _store_twice(value, mantissa, then + c, num_cells)
+            _store_twice(own, exponent, then + c, num_cells)
             top_of_row = maximum(own, top_of_row)
-        base[t] = largest(top_of_row)
-        if base[t] <= ABSENT:
+        base[t] = below
+        top[0] = largest(top_of_row)
+        if top[0] <= _ABSENT:
             return False
-        _rebase(mantissa, exponent, np.int32(base[t]), row, row_exponent, t * num_cells)
+        now, then = then, now
+    _leave_first(mantissa, exponent, now)
     return True
 
 
 @njit(nogil=True, cache=True)
 def advance_rows(  # type: ignore[no-untyped-def]
-    observations, inverse_scale, scaled_mean, log_norm, log_node, power, mantissa, exponent,
+    observations, inverse_scale, scaled_mean, log_norm, log_node, power, mantissa, exponent, top,
     shift, weight, weight_exponent, row, row_exponent, b, b_exponent, base, backward,
 ):  # fmt: skip
     """Do `emission_rows` and `message_rows` over a block, some steps at a time in the cache.
 
     One call a block: threads that return to the interpreter in between wait for each other.
+    With fewer rows than steps no row is kept, and the emissions are written over and over.
     Returns the log base [nat] of the message; NaN if some step has no mass at all.
     """
-    num_steps, log_base = len(row), 0.0
-    emission_base = np.empty(CACHED_STEPS)
-    num_parts = -(-num_steps // CACHED_STEPS)
+    num_steps, num_rows, log_base = len(observations), len(row), 0.0
+    is_kept = num_rows >= num_steps
+    part_steps = _cached_steps(row.shape[1]) if is_kept else num_rows
+    emission_base = np.empty(part_steps)
+    num_parts = -(-num_steps // part_steps)
     for k in range(num_parts):
-        first = (num_parts - 1 - k if backward else k) * CACHED_STEPS
-        last = min(first + CACHED_STEPS, num_steps)
+        first = (num_parts - 1 - k if backward else k) * part_steps
+        count = min(part_steps, num_steps - first)
+        start = first if is_kept else 0
+        stop = start + count
         emission_rows(
-            observations[first:last], inverse_scale, scaled_mean, log_norm, log_node, power,
-            b[first:last], b_exponent[first:last], emission_base,
+            observations[first : first + count], inverse_scale, scaled_mean, log_norm, log_node,
+            power, b[start:stop], b_exponent[start:stop], emission_base,
         )  # fmt: skip
         done = message_rows(
-            mantissa, exponent, b[first:last], b_exponent[first:last],
-            shift, weight, weight_exponent, row[first:last], row_exponent[first:last],
-            base[first:last], backward,
+            mantissa, exponent, top, b[start:stop], b_exponent[start:stop],
+            shift, weight, weight_exponent, row[start:stop], row_exponent[start:stop],
+            base[start:stop], backward, is_kept,
         )  # fmt: skip
         if not done:
             return np.nan
-        for t in range(last - first):
-            log_base += emission_base[t] + base[first + t] * _LN_2
+        for t in range(count):
+            log_base += emission_base[t] + base[start + t] * _LN_2
     return log_base
+
+
+def cached_steps(num_cells: int) -> int:
+    """Steps whose rows fit in a core's own cache, a multiple of four."""
+    return max(MIN_CACHED_STEPS, CACHED_CELLS // num_cells // 4 * 4)
+
+
+_cached_steps = njit(cached_steps)
 
 
 @njit(nogil=True, cache=True)
@@ -386,7 +457,7 @@ def _to_probabilities(product, exponent, first, top, out, t):  # type: ignore[no
 
 @njit(nogil=True, cache=True)
 def crossing_rows(  # type: ignore[no-untyped-def]
-    mantissa, exponent, b, b_exponent, other, other_exponent, other_base,
+    mantissa, exponent, top, b, b_exponent, other, other_exponent, other_base,
     shift, weight, weight_exponent, normalizer, smoothed, counts, counts_first_step, backward,
 ):  # fmt: skip
     """Carry one message across a block whose other message is stored: gamma and sum of xi.
@@ -404,15 +475,16 @@ def crossing_rows(  # type: ignore[no-untyped-def]
     counts: float64 (O, G), added to, the block's first step only if `counts_first_step`.
     """
     num_steps, num_cells = smoothed.shape
-    row, row_exponent = aligned_row(num_cells, _ZERO), aligned_row(num_cells, _ABSENT)
+    now, then = 0, 2 * num_cells
     part = aligned_row(weight.size, _ZERO)
     arriving = aligned_row(len(shift) * LANES, _ABSENT)
     term = aligned_row(len(shift) * LANES, _ZERO)
+    held, held_term = registers(EDGES, _ABSENT), registers(EDGES, _ZERO)
     ahead = -num_cells if backward else num_cells
     joint, power = normalizer[0], np.int64(normalizer[1])
     for k in range(num_steps):
         t = num_steps - 1 - k if backward else k
-        top_of_row, sums = broadcast(_NOTHING), broadcast(0.0)
+        top_of_row, sums, below = broadcast(_NOTHING), broadcast(0.0), top[0]
         factor, bottom = np.float32(1.0 / joint), np.int32(power - _BIAS)
         for c in range(0, num_cells, LANES):
             i = t * num_cells + c
@@ -420,13 +492,18 @@ def crossing_rows(  # type: ignore[no-untyped-def]
             prefetch(b_exponent, i + ahead)
             prefetch(other, i + ahead)
             prefetch(other_exponent, i + ahead)
-            top, total = _gather_terms(
-                mantissa, exponent, shift, weight, weight_exponent, c, arriving, term
-            )
+            if len(shift) == EDGES:
+                highest, total = _gather_edge_terms(
+                    mantissa, exponent, now + c, shift, weight, weight_exponent, c, held, held_term
+                )
+            else:
+                highest, total = _gather_terms(
+                    mantissa, exponent, now + c, shift, weight, weight_exponent, c, arriving, term
+                )
             there = load(other, i)
             own = where(
                 greater(there * total, broadcast(_ZERO)),
-                top + load(other_exponent, i) - bottom,
+                highest + load(other_exponent, i) - bottom,
                 broadcast(_SMALLEST),
             )
             share = there * _power_of_two(own) * factor
@@ -435,22 +512,54 @@ def crossing_rows(  # type: ignore[no-untyped-def]
             store(gamma, smoothed, i)
             sums += widen(gamma)
             if (k > 0 or counts_first_step) and any_lane(greater(gamma, broadcast(_NEGLIGIBLE))):
-                for o in range(len(shift)):
-                    j = o * num_cells + c
-                    store(load(part, j) + share * load(term, o * LANES), part, j)
-            value, own = _normalize(total * load(b, i), top + load(b_exponent, i))
-            store(value, row, c)
-            store(own, row_exponent, c)
+                if len(shift) == EDGES:
+                    for o in range(EDGES):
+                        j = o * num_cells + c
+                        store(load(part, j) + share * get(held_term, o), part, j)
+                else:
+                    for o in range(len(shift)):
+                        j = o * num_cells + c
+                        store(load(part, j) + share * load(term, o * LANES), part, j)
+            value, own = _normalize(total * load(b, i), highest + load(b_exponent, i) - below)
+            own = maximum(own, broadcast(_ABSENT))
+            _store_twice(value, mantissa, then + c, num_cells)
+            _store_twice(own, exponent, then + c, num_cells)
             top_of_row = maximum(own, top_of_row)
-        if k % 64 == 63 or k == num_steps - 1:  # float32 sums stay short
+        if k % 256 == 255 or k == num_steps - 1:  # float32 sums stay short
             _add_part(part, counts)
-        base = largest(top_of_row)
         joint *= add_lanes(sums)
+        top[0] = largest(top_of_row)
+        now, then = then, now
         if joint == 0.0:
             break
-        power += other_base[t] - base
-        _rebase(mantissa, exponent, base, row, row_exponent, 0)
+        power += other_base[t] - below
+    _leave_first(mantissa, exponent, now)
     normalizer[0], normalizer[1] = joint, power
+
+
+@njit(nogil=True, cache=True)
+def crossing_sums(  # type: ignore[no-untyped-def]
+    mantissa, exponent, top, b, b_exponent, other, other_exponent, other_base,
+    shift, weight, weight_exponent, normalizer, counts, counts_first_step, backward,
+    observations, center, with_gaps, sums,
+):  # fmt: skip
+    """Do `crossing_rows` and `add_moments` over a block, some steps at a time in the cache.
+
+    gamma takes the place of `other`.
+    """
+    num_steps, part_steps = len(other), _cached_steps(other.shape[1])
+    num_parts = -(-num_steps // part_steps)
+    for k in range(num_parts):
+        first = (num_parts - 1 - k if backward else k) * part_steps
+        last = min(first + part_steps, num_steps)
+        crossing_rows(
+            mantissa, exponent, top, b[first:last], b_exponent[first:last], other[first:last],
+            other_exponent[first:last], other_base[first:last], shift, weight, weight_exponent,
+            normalizer, other[first:last], counts, counts_first_step or k > 0, backward,
+        )  # fmt: skip
+        if not 0.0 < normalizer[0] < np.inf:
+            return
+        add_moments(other[first:last], observations[first:last], center, with_gaps, sums)
 
 
 @njit(nogil=True, cache=True)
@@ -466,7 +575,7 @@ def joint_sum(  # type: ignore[no-untyped-def]
     arriving = aligned_row(len(shift) * LANES, _ABSENT)
     highest, sums = lowest, broadcast(0.0)
     for c in range(0, num_cells, LANES):
-        top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
+        top, total = _gather(mantissa, exponent, c, shift, weight, weight_exponent, c, arriving)
         product = total * load(other, c)
         is_there = greater(product, broadcast(_ZERO))
         own = where(is_there, top + load(other_exponent, c), lowest)
@@ -481,28 +590,49 @@ def joint_sum(  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _gather_terms(mantissa, exponent, shift, weight, weight_exponent, c, arriving, term):  # type: ignore[no-untyped-def]
+def _gather_terms(  # type: ignore[no-untyped-def]
+    mantissa, exponent, first, shift, weight, weight_exponent, c, arriving, term
+):
     """Do as `_gather`, and leave the summands, which add up to `total`, in `term`."""
     num_shifts, num_cells = weight.shape
-    top = broadcast(_NOTHING)
+    top, total = broadcast(_NOTHING), broadcast(_ZERO)
     for o in range(num_shifts):
-        own = load(exponent, load_one(shift, o) + c) + load(weight_exponent, o * num_cells + c)
+        own = load(exponent, load_one(shift, o) + first) + load(weight_exponent, o * num_cells + c)
         store(own, arriving, o * LANES)
         top = maximum(own, top)
-    total, bottom = broadcast(_ZERO), top - _BIAS
+    bottom = top - _BIAS
     for o in range(num_shifts):
-        scale = _power_of_two(load(arriving, o * LANES) - bottom)
-        product = load(mantissa, load_one(shift, o) + c) * load(weight, o * num_cells + c)
-        product = product * scale
+        product = load(mantissa, load_one(shift, o) + first) * load(weight, o * num_cells + c)
+        product = product * _power_of_two(load(arriving, o * LANES) - bottom)
         store(product, term, o * LANES)
         total += product
     return top, total
 
 
 @njit(forceinline=True)
+def _gather_edge_terms(  # type: ignore[no-untyped-def]
+    mantissa, exponent, first, shift, weight, weight_exponent, c, held, term
+):
+    """Do as `_gather_terms` for EDGES diagonals, in registers."""
+    num_cells = weight.shape[1]
+    top, total = broadcast(_NOTHING), broadcast(_ZERO)
+    for o in range(EDGES):
+        own = load(exponent, load_one(shift, o) + first) + load(weight_exponent, o * num_cells + c)
+        put(held, o, own)
+        top = maximum(own, top)
+    bottom = top - _BIAS
+    for o in range(EDGES):
+        product = load(mantissa, load_one(shift, o) + first) * load(weight, o * num_cells + c)
+        product = product * _power_of_two(get(held, o) - bottom)
+        put(term, o, product)
+        total += product
+    return top, total
+
+
+@njit(forceinline=True)
 def _add_part(part, counts):  # type: ignore[no-untyped-def]
-    """Do counts += part in float64, and empty `part`."""
-    for i in range(0, part.size, LANES):
+    """Do counts += part in float64, and empty so much of `part`."""
+    for i in range(0, counts.size, LANES):
         store(load(counts, i) + widen(load(part, i)), counts, i)
         store(broadcast(_ZERO), part, i)
 
@@ -533,10 +663,7 @@ def add_moments(smoothed, observations, center, with_gaps, sums):  # type: ignor
                     features[t - start, 1 + 2 * obs_dim + d] = _ONE if is_missing else _ZERO
         for first in range(start, stop, 16):
             _add_outer(smoothed, first, min(first + 16, stop), features, start, part)
-        for f in range(num_features):
-            for c in range(num_cells):
-                sums[f, c] += part[f, c]
-        part[:] = _ZERO
+        _add_part(part, sums)
 
 
 @njit
@@ -597,7 +724,7 @@ def filter_row(  # type: ignore[no-untyped-def]
         jump_mantissa, jump_exponent = np.float32(fraction), np.int32(power)
     top_of_row = broadcast(_NOTHING)
     for c in range(0, num_cells, LANES):
-        top, total = _gather(mantissa, exponent, shift, weight, weight_exponent, c, arriving)
+        top, total = _gather(mantissa, exponent, c, shift, weight, weight_exponent, c, arriving)
         if jump > 0.0:
             higher = maximum(top, broadcast(jump_exponent))
             total = total * _power_of_two(top - higher + _BIAS)
@@ -610,7 +737,7 @@ def filter_row(  # type: ignore[no-untyped-def]
     highest = largest(top_of_row)
     if highest <= _ABSENT:
         return -np.inf, before
-    _rebase(mantissa, exponent, highest, row, row_exponent, 0)
+    _rebase(mantissa, exponent, highest, row, row_exponent)
     return _to_probabilities(row, row_exponent, 0, np.int32(0), out, 0) + highest, before
 
 
@@ -650,3 +777,103 @@ def backtrack(choice, shift, last, path):  # type: ignore[no-untyped-def]
     for t in range(choice.shape[0] - 1, -1, -1):
         last = (last + shift[choice[t, last]]) % num_cells
         path[t] = last
+
+
+@njit(nogil=True, cache=True)
+def lay_out_edges(  # type: ignore[no-untyped-def]
+    logits, odds, lowest, slot, entering, leaving, weight_in, weight_in_exponent, weight_out,
+    weight_out_exponent, log_weight_in,
+):  # fmt: skip
+    """Write a_ij, the shares of each node's odds, to the tables (O, G) of a chain, laid out flat.
+
+    logits (N, K): -inf where there is no edge; odds = exp(logits), taken outside, where it is done
+    eight at a time. lowest: floor of log a_ij [nat]. slot, entering, leaving (E,): `Diagonals`.
+    """
+    log_total = np.empty(logits.shape[0])
+    total = np.empty(logits.shape[0])
+    for n in range(logits.shape[0]):
+        total[n] = 0.0
+        for k in range(logits.shape[1]):
+            total[n] += odds[n, k]
+        log_total[n] = math.log(total[n])
+    share, one_to_two = np.empty(1), np.empty(1)
+    bits, own_bits = share.view(np.int64), one_to_two.view(np.int64)
+    smallest, width = math.exp(lowest), logits.shape[1]
+    for e in range(len(slot)):
+        n = slot[e] // width
+        k = slot[e] - n * width
+        share[0] = max(odds[n, k] / total[n], smallest)
+        own_bits[0] = (bits[0] & _FRACTION_64) | _ONE_64
+        mantissa, power = np.float32(one_to_two[0]), np.int32((bits[0] >> 52) - 1023)
+        into, out_of = entering[e], leaving[e]
+        log_weight_in[into] = max(logits[n, k] - log_total[n], lowest)
+        weight_in[into], weight_in_exponent[into] = mantissa, power
+        weight_out[out_of], weight_out_exponent[out_of] = mantissa, power
+
+
+@njit(nogil=True, cache=True)
+def lay_out_gaussians(mean, log_scale, factor, cell, inverse_scale, scaled_mean, log_norm):  # type: ignore[no-untyped-def]
+    """Write (N, D) parameters to the tables (D, G) of a chain; factor = exp(-log_scale)."""
+    for n in range(mean.shape[0]):
+        c = cell[n]
+        for d in range(mean.shape[1]):
+            inverse_scale[d, c] = factor[n, d]
+            scaled_mean[d, c] = mean[n, d] * factor[n, d]
+            log_norm[d, c] = -_HALF_LOG_2_PI - log_scale[n, d]
+
+
+@njit(nogil=True, cache=True)
+def expected_moments(sums, cell, center, with_gaps, node, weight, first, second):  # type: ignore[no-untyped-def]
+    """Turn `add_moments`' sums of two halves (2, F, G) into moments about zero, by node (N, D)."""
+    obs_dim = len(center)
+    for n in range(len(cell)):
+        c = cell[n]
+        node[n] = sums[0, 0, c] + sums[1, 0, c]
+        for d in range(obs_dim):
+            known = node[n]
+            if with_gaps:
+                known -= sums[0, 1 + 2 * obs_dim + d, c] + sums[1, 1 + 2 * obs_dim + d, c]
+            total = sums[0, 1 + d, c] + sums[1, 1 + d, c]
+            squares = sums[0, 1 + obs_dim + d, c] + sums[1, 1 + obs_dim + d, c]
+            weight[n, d] = known
+            first[n, d] = total + known * center[d]
+            second[n, d] = squares + 2 * center[d] * total + known * center[d] ** 2
+
+
+@njit(nogil=True, cache=True)
+def best_edges(counts, mask, pseudo_count, least, lowest, logits):  # type: ignore[no-untyped-def]
+    """M-step of the transitions (N, K) (eq. 8), in place: log shares, not under `lowest`.
+
+    A node with no more than `least` transitions keeps its own.
+    """
+    for n in range(counts.shape[0]):
+        total = 0.0
+        for k in range(counts.shape[1]):
+            total += counts[n, k] + pseudo_count if mask[n, k] else 0.0
+        if total > least:
+            for k in range(counts.shape[1]):
+                if mask[n, k]:
+                    share = (counts[n, k] + pseudo_count) / total
+                    logits[n, k] = max(math.log(share), lowest) if share > 0.0 else lowest
+
+
+@njit(nogil=True, cache=True)
+def best_gaussians(  # type: ignore[no-untyped-def]
+    weight, first, second, trace, min_variance, least, mean, log_scale, variance
+):
+    """M-step of the Gaussians (N, D) (eqs. 9-11): `mean` in place, and the new variances.
+
+    A reading of a node that was had no more than `least` times keeps its own mean; its variance is
+    1, to be overlooked.
+    """
+    for n in range(mean.shape[0]):
+        for d in range(mean.shape[1]):
+            variance[n, d] = 1.0
+            if weight[n, d] > least:
+                new = first[n, d] / weight[n, d]
+                spread = max(second[n, d] / weight[n, d] - new**2, min_variance)
+                if trace > 0.0:
+                    new = (1 - trace) * new + trace * mean[n, d]
+                    spread = (1 - trace) * spread + trace * math.exp(2 * log_scale[n, d])
+                mean[n, d] = new
+                variance[n, d] = max(spread, min_variance)

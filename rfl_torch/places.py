@@ -378,16 +378,36 @@ def within(edges: csr_array, most: int) -> csr_array:
 
 
 def find_telling(twins: csr_array, edges: csr_array) -> Labels:
-    """Nodes at which a robot can tell where it is: they have no twins, nor have those around them.
+    """Nodes at which a robot can tell where it is: no place looks like them, as far as is known.
 
-    Of the parts into which the others cut the map the smaller ones are left out: what was seen in
-    one of two rooms alone may be in the other too. All nodes, if there are no twins, or if nothing
-    is left.
+    What was seen in one of two rooms alone may be in the other too. What both lead to is not: of
+    the parts of the map without twins, those count that two nodes that look the same lie beside,
+    or the larger ones if none does. Of their nodes, those NEAR edges away from all twins, if there
+    are any. All nodes, if there are no twins, or if nothing is left.
     """
     has_twin = twins.sum(1) > 0
-    (alone,) = np.nonzero(within(edges, NEAR) @ has_twin.astype(np.float64) == 0)
-    if not has_twin.any() or not len(alone):
+    (twin,) = np.nonzero(has_twin)
+    room = np.full(len(has_twin), -1)
+    room[twin] = connected_components(edges[twin][:, twin], directed=False)[1]
+    first, second = room[np.array(twins.nonzero())]
+    pairs = np.unique(np.stack([first, second], 1)[first != second], axis=0)
+    alone, part = _parts(edges, has_twin, 1)
+    inside = csr_array((np.ones(len(alone)), (part, alone)), (part.max(initial=-1) + 1, len(room)))
+    beside = (inside @ within(edges, 2)).toarray() > 0
+    told = [
+        k for k, near in enumerate(beside) if np.isin(pairs, room[near & has_twin]).all(1).any()
+    ]
+    far, far_part = _parts(edges, has_twin, NEAR)
+    if told:
+        between = alone[np.isin(part, told)]
+        return np.intersect1d(between, far) if np.isin(between, far).any() else between
+    if not has_twin.any() or not len(far):
         return np.arange(len(has_twin))
-    _, part = connected_components(edges[alone][:, alone], directed=False)
-    size = np.bincount(part)[part]
-    return np.asarray(alone[2 * size >= size.max()])
+    size = np.bincount(far_part)[far_part]
+    return np.asarray(far[2 * size >= size.max()])
+
+
+def _parts(edges: csr_array, has_twin: NDArray[np.bool_], away: int) -> tuple[Labels, Labels]:
+    """Nodes more than so many edges from all twins, and which of them hang together."""
+    (alone,) = np.nonzero(within(edges, away) @ has_twin.astype(np.float64) == 0)
+    return alone, connected_components(edges[alone][:, alone], directed=False)[1]

@@ -4,13 +4,12 @@ EM on a grid finds what belongs together in time: two corridors that look the sa
 different nodes. Yet a grid with too few nodes, or a fold in it, makes one node stand for two places
 that look different. Both are repaired from the log alone:
 
-    look     observations within one radius of each other, by mean absolute difference
+    look     what is seen within a few actions (`looks`)
     place    where the log's track is (`places`); where actions don't add up to positions, a set of
              nodes that the log goes to and fro between
     node     one look at one place
 
-The new nodes lie on no lattice: they are joined where the log went. Looks are compared by absolute
-differences because a ray that slips past a corner jumps: squared, one jump outweighs the others.
+The new nodes lie on no lattice: they are joined where the log went.
 """
 
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
-from scipy.spatial.distance import cdist
 
 from rfl_torch import places
 from rfl_torch.hmm import GridHMM
@@ -29,100 +27,12 @@ from rfl_torch.innate import directions, nearest_direction
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-LOOK_STEPS = 2.0
-"""Radius of a look in full actions, about half the way between the paper's nodes. Wider looks mix
-places (share of mixed steps 0.6 % with 2.5), narrower ones make more nodes than are needed."""
-
-LONGEST_LAG = 8
-"""Steps over which the change of the observations is measured."""
-
-ROUNDS = 3
-"""Times that looks are centred anew on the medians of their observations."""
-
 LEAST_VISITS = 4
 """A place of fewer steps is taken for a slip of recognition: it joins the place that the log had
 the look at last, or has next."""
 
 MIN_SCALE = 0.02
 """Floor of the rebuilt nodes' standard deviations, in normalised units."""
-
-BATCH = 1024
-"""Observations compared with all looks at a time."""
-
-
-LEAST_RADIUS = 1e-9
-"""Radius that is as good as none, yet can be divided by."""
-
-
-def look_radius(observations: list[Array], unit_actions: list[NDArray[np.float32]]) -> float:
-    """Mean absolute change of a normalised observation over LOOK_STEPS full actions.
-
-    A line is fitted to the changes over 1 to LONGEST_LAG steps against the length of the summed
-    actions: its slope is motion, its offset noise. A radius must hold both.
-
-    Args:
-        observations: (T+1, D) each, without missing readings.
-        unit_actions: (T, A) each, in [0, 1].
-    """
-    change, length = [], []
-    for seen, actions in zip(observations, unit_actions, strict=True):
-        total = np.concatenate([np.zeros((1, actions.shape[1])), (2 * actions - 1).cumsum(0)])
-        for lag in range(1, min(LONGEST_LAG, len(actions)) + 1):
-            change.append(np.abs(seen[lag:] - seen[:-lag]).mean(1))
-            length.append(np.abs(total[lag:] - total[:-lag]).max(1))
-    x, y = np.concatenate(length), np.concatenate(change)
-    is_near = (x > 0) & (x <= 2 * LOOK_STEPS)
-    edges = np.quantile(x[is_near], np.linspace(0, 1, 11))
-    part = np.digitize(x[is_near], edges[1:-1])
-    middle = [np.median(x[is_near][part == k]) for k in range(10) if (part == k).any()]
-    median = [np.median(y[is_near][part == k]) for k in range(10) if (part == k).any()]
-    slope, offset = np.polyfit(middle, median, 1) if len(middle) > 1 else (0.0, float(median[0]))
-    radius = max(0.0, offset) + LOOK_STEPS * max(0.0, slope)
-    return float(max(radius, LEAST_RADIUS))  # readings that hold still while actions go on have 0
-
-
-def find_looks(observations: Array, radius: float) -> Array:
-    """Centres of looks (L, D) such that each observation (T, D) lies within `radius` of one.
-
-    An observation that is farther from all centres so far becomes one.
-    """
-    centers: list[Array] = []
-    for begin in range(0, len(observations), BATCH):
-        batch = observations[begin : begin + BATCH]
-        nearest = distance(batch, np.array(centers)).min(1) if centers else np.inf
-        nearest = np.broadcast_to(nearest, len(batch)).copy()
-        for row in range(len(batch)):
-            if nearest[row] > radius:
-                centers.append(batch[row])
-                away = distance(batch[row:], batch[row : row + 1])[:, 0]
-                nearest[row:] = np.minimum(nearest[row:], away)
-    return np.array(centers)
-
-
-def center_looks(observations: Array, centers: Array) -> tuple[Labels, Array]:
-    """Assign observations (T, D) to the nearest centre and move centres to the medians, in turn."""
-    for _ in range(ROUNDS):
-        look = nearest_look(observations, centers)
-        order = look.argsort(kind="stable")
-        first = np.unique(look[order], return_index=True)[1]
-        groups = np.split(observations[order], first[1:])
-        centers = np.array([np.median(group, 0) for group in groups])
-    return nearest_look(observations, centers), centers
-
-
-def nearest_look(observations: Array, centers: Array) -> Labels:
-    """Index of the nearest centre of each observation, int64 (T,)."""
-    return np.concatenate(
-        [
-            distance(observations[begin : begin + BATCH], centers).argmin(1)
-            for begin in range(0, len(observations), BATCH)
-        ]
-    )
-
-
-def distance(a: Array, b: Array) -> Array:
-    """Mean absolute differences between rows, (len(a), len(b))."""
-    return cdist(a, b, "cityblock") / a.shape[1]
 
 
 def split_by_place(looks: list[Labels], paths: list[Labels]) -> list[Labels]:
@@ -300,6 +210,12 @@ def rebuild(
     joined = csr_array(edges + pseudo_count * (edges.astype(bool) + eye_array(num_nodes)))
     if is_reversible:
         joined = csr_array(joined + pseudo_count * edges.T.astype(bool))
+    ends = np.asarray(joined.sum(1) == 0).ravel()  # come to by the last step of all, and once
+    if ends.any():
+        joined = csr_array(
+            joined
+            + csr_array((ends.astype(np.float64), np.arange(num_nodes), np.arange(num_nodes + 1)))
+        )
     # The recursions lay the graph out by diagonals: few, if neighbours have near numbers.
     order = reverse_cuthill_mckee(csr_array(joined), symmetric_mode=is_reversible)
     cell = np.empty(num_nodes, np.int64)

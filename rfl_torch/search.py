@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfl_torch.innate import directions
-from rfl_torch.repair import distance
+from rfl_torch.looks import distance
 
 HOLD = 10
 """Steps that an action is held at one look at most."""
@@ -19,7 +19,7 @@ class Search:
 
     Args:
         low, high: bounds of the action space, (A,).
-        radius: of a look, see `repair.look_radius`.
+        radius: of a look, see `looks.look_radius`.
         seed: decides between actions that were tried equally often.
     """
 

@@ -13,6 +13,7 @@ The compiler splits a tile over whatever registers the machine has. Indices coun
 start of a C-contiguous array, whatever its shape, and are not checked.
 """
 
+import math
 import operator
 from typing import Any
 
@@ -31,7 +32,7 @@ _LINE = 64
 def aligned_empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Uninitialised array that starts on a cache line."""
     dtype = np.dtype(dtype)
-    size = int(np.prod(shape)) * dtype.itemsize
+    size = math.prod(shape) * dtype.itemsize
     buffer = np.empty(size + _LINE, np.uint8)
     start = -buffer.ctypes.data % _LINE
     return buffer[start : start + size].view(dtype).reshape(shape)
@@ -65,6 +66,22 @@ class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, vector: Vector) -> None:
         element = manager.lookup(vector.dtype).get_value_type()
         super().__init__(manager, vector, ir.VectorType(element, LANES))
+
+
+class Registers(types.Type):
+    """The numba type of a few vectors of one scalar type, see `registers`."""
+
+    def __init__(self, dtype: types.Type, count: int) -> None:
+        self.dtype, self.count = dtype, count
+        super().__init__(f"Registers({dtype}, {count})")
+
+
+@register_model(Registers)
+class _RegistersModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kept: Registers) -> None:
+        element = manager.lookup(kept.dtype).get_value_type()
+        tiles = ir.ArrayType(ir.VectorType(element, LANES), kept.count)
+        super().__init__(manager, kept, tiles.as_pointer())
 
 
 _FLAGS = ("contract", "nsz", "arcp")
@@ -274,6 +291,42 @@ widen = _conversion(types.float32, types.float64, "fpext")
 to_int = _conversion(types.float64, types.int32, "fptosi")
 as_bits = _conversion(types.float32, types.int32, "bitcast")
 as_float = _conversion(types.int32, types.float32, "bitcast")
+
+
+@intrinsic(prefer_literal=True)
+def registers(typing_context, count, like):  # type: ignore[no-untyped-def]
+    """Room for `count` vectors of the type of `like`, uninitialised.
+
+    They stay in registers where every index is a constant: in loops over a constant `range`, which
+    the compiler unrolls. Else they lie on the stack.
+    """
+    kind = Registers(like, count.literal_value)
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return cgutils.alloca_once(builder, context.get_value_type(kind).pointee)
+
+    return kind(count, like), generate
+
+
+@intrinsic
+def put(typing_context, kept, index, value):  # type: ignore[no-untyped-def]
+    """Write one of the vectors that `registers` holds."""
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        builder.store(args[2], builder.gep(args[0], [ir.IntType(64)(0), args[1]]))
+        return context.get_dummy_value()
+
+    return types.void(kept, types.intp, value), generate
+
+
+@intrinsic
+def get(typing_context, kept, index):  # type: ignore[no-untyped-def]
+    """Read one of the vectors that `registers` holds."""
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.load(builder.gep(args[0], [ir.IntType(64)(0), args[1]]))
+
+    return Vector(kept.dtype)(kept, types.intp), generate
 
 
 @intrinsic

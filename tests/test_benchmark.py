@@ -14,6 +14,7 @@ def small(monkeypatch):
     """A job of a moment, on the processor cores that the tests had before."""
     monkeypatch.setattr(benchmark, "NUM_STEPS", 60)
     monkeypatch.setattr(benchmark, "SHAPE", (4, 4))
+    monkeypatch.setattr(benchmark, "ROUNDS", 2)
     cores, threads = os.sched_getaffinity(0), torch.get_num_threads()
     yield
     os.sched_setaffinity(0, cores)
@@ -34,6 +35,14 @@ def test_every_timed_iteration_starts_from_the_same_model():
     work = benchmark.iterate(job)
     first, second = work(), work()
     assert torch.equal(first.log_likelihood, second.log_likelihood)
+
+
+def test_what_is_compared_is_run_in_turn_and_the_second_of_two_runs_counts(monkeypatch):
+    calls, now = [], iter([0.0, 3.0, 3.0, 8.0, 8.0, 10.0, 10.0, 16.0])
+    monkeypatch.setattr(benchmark, "clock", lambda: next(now))
+    works = [lambda: calls.append("a"), lambda: calls.append("b")]
+    assert benchmark.best_in_turn(works, 2) == [2.0, 5.0]
+    assert calls == list("aabbaabb")
 
 
 def test_the_plain_loop_takes_the_jobs_arrays():

@@ -118,3 +118,9 @@ def test_nothing_to_write_is_refused(tmp_path, capsys, monkeypatch):
         cli.run(export.main, export.Config, export.__doc__)
     assert end.value.code == cli.BAD_INPUT
     assert "--graphml" in capsys.readouterr().err
+
+
+def test_an_agent_that_looks_ahead_has_no_controllers_to_export(agents, monkeypatch):
+    monkeypatch.setattr(type(agents["rbf"]), "motion", object())
+    with pytest.raises(ValueError, match=r"^this agent chooses actions by looking ahead"):
+        export.export_controllers(agents["rbf"])

@@ -10,6 +10,7 @@ import sims  # noqa: F401
 from experiments import faults
 from experiments.faults import FAULTS
 from rfl_torch import Agent, AgentConfig, record
+from rfl_torch.executor import CONFIRMED
 from rfl_torch.senses import Sensors, believed
 
 TASKS = 12
@@ -63,6 +64,20 @@ def test_a_familiar_sight_after_many_strange_ones_is_no_arrival_yet(agent):
         said.append(executor.status)
     assert said == ["running"] * 11 + ["reached"]
     assert executor.node == 7
+
+
+def test_a_belief_that_jumped_says_it_arrived_only_once_it_has_stayed_for_some_steps(agent):
+    sights = agent.raw_readings(agent.hmm.emission_mean.detach().numpy()).astype(np.float32)
+    far = int(np.flatnonzero(agent.near[[7]].toarray()[0] == 0)[0])
+    executor = agent.executor(7)
+    for _ in range(5):
+        executor.act(sights[far])
+    assert executor.node == far
+    said = []
+    while not said or said[-1] == "running":
+        executor.act(sights[7])
+        said += [executor.status] if executor.node == 7 else []
+    assert said == ["running"] * CONFIRMED + ["reached"]
 
 
 def test_readings_that_do_not_fit_where_the_others_agree_are_left_out():

@@ -41,7 +41,7 @@ def test_recognition_finds_the_best_of_all_paths_with_jumps_and_unknown_steps():
 def test_unknown_steps_get_one_new_node_for_each_look():
     path = np.array([0, -1, -1, -1, 1, -1])
     seen = np.array([[9.0], [0.0], [0.01], [1.0], [9.0], [0.0]])
-    found = growth.add_looks(path, seen, 0.1, 2)
+    found = growth.add_looks(path, seen, np.ones((5, 1), np.float32), 0.1, 2)
     assert found.tolist() == [0, 2, 2, 3, 1, 2]
 
 

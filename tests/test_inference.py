@@ -325,6 +325,8 @@ def test_block_boundaries_change_nothing(block, monkeypatch):
     whole = hmm.e_step(observations), hmm.smooth(observations), hmm.filter(observations)
     monkeypatch.setattr(inference, "BLOCK", block)
     monkeypatch.setattr(inference, "_CACHE_BLOCK", block)
+    monkeypatch.setattr(inference, "_SEGMENT_CELLS", 20 * 16)  # segments of 20 steps, in a first
+    monkeypatch.setattr(inference.kernels, "cached_steps", lambda num_cells: 7)  # run 7 at a time
     statistics, smoothed, filtered = whole
     cut = hmm.e_step(observations)
     close(hmm.smooth(observations), smoothed)
@@ -339,7 +341,8 @@ def test_block_boundaries_change_nothing(block, monkeypatch):
 def test_a_log_longer_than_two_blocks_is_treated_as_one_sequence(monkeypatch):
     hmm = random_hmm((3, 3), 1, 12)
     monkeypatch.setattr(inference, "BLOCK", 4096)
-    num_steps = 2 * inference.BLOCK + 1_001  # each half needs two blocks
+    monkeypatch.setattr(inference, "_SEGMENT_CELLS", 0)
+    num_steps = 2 * inference.BLOCK + 1_001  # each half is run twice over 500 steps, 22 at a time
     observations = hmm.sample(num_steps, torch.Generator().manual_seed(4)).observations
     cut = hmm.e_step(observations), hmm.smooth(observations), hmm.log_likelihood(observations)
     monkeypatch.setattr(inference, "BLOCK", num_steps)
@@ -471,6 +474,21 @@ def test_one_thread_and_two_give_the_same_bits_every_time(cores, monkeypatch):
     again = hmm.e_step(observations)
     for name in ("initial", "node", "edge", "weight", "first", "second", "log_likelihood"):
         assert torch.equal(getattr(first, name), getattr(again, name))
+
+
+def test_an_error_on_two_threads_leaves_neither_at_work_on_the_next_log(monkeypatch):
+    hmm = map_hmm()
+    observations = map_data("held-out", hmm)
+    monkeypatch.setattr(inference, "_SHORT", 0)
+    monkeypatch.setattr(inference, "_num_cores", lambda: 2)
+    expected = hmm.e_step(observations).log_likelihood
+    far = observations.clone()
+    far[len(far) // 4] = 1e9  # the forward thread fails at once, the other runs on
+    far[len(far) // 4 + 1] = -1e9
+    for _ in range(3):
+        with pytest.raises(ValueError, match="from every node"):
+            hmm.e_step(far)
+        assert torch.equal(hmm.e_step(observations).log_likelihood, expected)
 
 
 def test_what_is_left_out_of_the_sums_is_within_the_stated_bound():

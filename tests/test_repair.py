@@ -6,36 +6,6 @@ from scipy.sparse import csr_array
 from rfl_torch import GridHMM, repair
 
 
-def test_a_look_is_as_wide_as_its_steps_are_far():
-    rng = np.random.default_rng(0)
-    action = rng.random((4000, 1)).astype(np.float32)
-    position = np.concatenate([[0.0], (2 * action[:, 0] - 1).cumsum()])
-    seen = 0.01 * position[:, None] * np.ones((1, 6))
-    radius = repair.look_radius([seen], [action])
-    assert radius == pytest.approx(0.01 * repair.LOOK_STEPS, rel=0.02)
-    noisy = seen + 0.02 * rng.standard_normal(seen.shape)
-    apart = [np.abs(noisy[t + 4] - noisy[t]).mean() for t in range(3990)]
-    moved = np.array([abs(position[t + 4] - position[t]) for t in range(3990)])
-    typical = np.median(np.array(apart)[np.abs(moved - repair.LOOK_STEPS) < 0.2])
-    assert repair.look_radius([noisy], [action]) == pytest.approx(typical, rel=0.1)
-
-
-def test_every_observation_lies_within_a_radius_of_a_look_and_looks_lie_apart():
-    seen = np.random.default_rng(1).random((3000, 3))
-    centers = repair.find_looks(seen, 0.1)
-    away = np.abs(seen[:, None] - centers[None]).mean(-1)
-    assert (away.min(1) <= 0.1).all()
-    between = np.abs(centers[:, None] - centers[None]).mean(-1)
-    assert between[np.triu_indices(len(centers), 1)].min() > 0.1
-
-
-def test_centred_looks_are_the_medians_of_what_is_nearest_to_them():
-    seen = np.concatenate([np.zeros((5, 2)), np.ones((6, 2)), [[0.0, 0.4]]])
-    look, centers = repair.center_looks(seen, np.array([[0.2, 0.2], [0.8, 0.9], [5.0, 5.0]]))
-    assert look.tolist() == [0] * 5 + [1] * 6 + [0]
-    assert centers.tolist() == [[0.0, 0.0], [1.0, 1.0]]  # the look that nothing has is gone
-
-
 def two_corridors():
     """Old nodes 0-4 to and fro, a bridge 10-19, then 5-9 which look the same."""
     there = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
@@ -145,12 +115,6 @@ def test_inference_on_a_rebuilt_map_is_that_of_its_dense_transitions():
     assert hmm.log_likelihood(value).item() == pytest.approx(alpha.logsumexp(0).item(), rel=1e-6)
 
 
-def test_readings_that_hold_still_leave_a_radius_to_divide_by():
-    still = np.zeros((100, 1))
-    radius = repair.look_radius([still], [np.ones((99, 1), np.float32)])
-    assert 0 < radius < 1e-6
-
-
 def test_nodes_keep_the_number_of_the_old_node_that_they_share_most_steps_with():
     before = np.array([0, 0, 0, 1, 1, 2, 2, 3])
     nodes = np.array([2, 2, 0, 0, 0, 4, 4, 4, 1, 3])  # 3 has joined 2; 1 and 3 are new
@@ -169,3 +133,13 @@ def test_numbers_have_no_gaps_when_nodes_are_gone():
         num_nodes = len(np.unique(nodes))
         assert set(found) == set(range(num_nodes))
         assert len({*zip(found.tolist(), nodes.tolist(), strict=True)}) == num_nodes
+
+
+def test_a_node_that_only_the_last_step_came_to_can_be_stayed_at():
+    path = np.array([0, 1, 0, 1, 2])
+    counts = repair.Counts.of([path], [np.eye(3)[path]], 3)
+    hmm = GridHMM((2, 2), 3)
+    repair.rebuild(hmm, counts, False, 0.3, 0.0)
+    transition = hmm.transition_matrix().detach().numpy()
+    np.testing.assert_allclose(transition.sum(1), 1.0)
+    assert transition[2, 2] == pytest.approx(1.0)
