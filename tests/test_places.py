@@ -131,6 +131,17 @@ def test_a_track_comes_back_where_actions_add_up(walk):
     assert not places.follow_track(looks, seen, [actions[0][order]], walk.radius).comes_back
 
 
+def test_a_track_is_believed_only_if_what_was_asked_for_shows_in_it(walk, monkeypatch):
+    """A car at the end of its road is where it was, too, whatever it is asked for."""
+    track, (_, _, actions) = walk.track(), walk.parts(1)
+    asked = 2.0 * actions[0] - 1.0
+    shown = 1 - np.square(asked - track.shifts[0]).sum() / np.square(asked).sum()
+    assert shown > 0.7
+    for least, is_believed in ((shown - 0.01, True), (shown + 0.01, False)):
+        monkeypatch.setattr(places, "SHOWN", least)
+        assert walk.track().comes_back == is_believed
+
+
 def test_a_robot_that_only_goes_round_never_comes_back():
     """Each time around is farther on."""
     rng = np.random.default_rng(0)
