@@ -129,12 +129,15 @@ class Sight:
     def look_around(self, step: int) -> tuple[Labels, Array]:
         """Steps (M,) that see something like what is seen at a step, and how far away they are."""
         away = distance(self.seen[step : step + 1], self.seen)[0]
-        around = away.argpartition(min(AROUND, len(away)) - 1)[:AROUND]
         (near,) = np.nonzero(away <= LOOK_RADII * self._radius)
-        return near, self._measure(step, near, around)
+        return near, self._measure(step, near, away)
 
-    def _measure(self, step: int, others: Labels, around: Labels) -> Array:
-        """Mahalanobis distances (M,) from a step to others by the changes at the steps around."""
+    def _measure(self, step: int, others: Labels, away: Array) -> Array:
+        """Mahalanobis distances (M,) from a step to others by the changes at the steps around it.
+
+        Those are the ones least `away` (T,) from it by mean absolute difference.
+        """
+        around = away.argpartition(min(AROUND, len(away)) - 1)[:AROUND]
         spread = self._change[around].T @ self._change[around]
         spread /= max(self._length[around].sum(), 1e-12)
         spread += max(FLAT * spread.trace() / len(spread), 1e-12) * np.eye(len(spread))
@@ -147,12 +150,11 @@ class Sight:
         units = [np.empty(0)]
         for step in np.linspace(0, len(self.seen) - 1, NUM_UNITS).astype(np.int64):
             away = distance(self.seen[step : step + 1], self.seen)[0]
-            around = away.argpartition(min(AROUND, len(away)) - 1)[:AROUND]
             later = np.arange(step + 1, min(step + 1 + LONGEST_LAG, len(self.seen)))
             later = later[self._log[later] == self._log[step]]
             length = np.linalg.norm(self._sum[later] - self._sum[step], axis=1)
             is_near = (length >= LOOK_STEPS / 2) & (length <= 2 * LOOK_STEPS)
-            units.append(self._measure(step, later[is_near], around) / length[is_near])
+            units.append(self._measure(step, later[is_near], away) / length[is_near])
         unit = np.concatenate(units)
         return float(np.median(unit)) if len(unit) else 1.0
 
