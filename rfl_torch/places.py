@@ -80,7 +80,6 @@ COMES_BACK = 0.15
 far any other step is: medians. In mazes it is 0.03 to 0.07, for pendulums and cars 0.6 to 1.6, and
 0.2 in rooms of ten by ten actions, where everything is near."""
 
-
 SHOWN = 0.5
 """Least share of the actions' variance that shows in the shifts, for actions to lead somewhere. In
 mazes it is 0.78 to 0.93; for a car that stands at the end of its road, 0.03: it comes back, too."""
