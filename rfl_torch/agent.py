@@ -35,6 +35,8 @@ from rfl_torch.controllers import (
     pool_sparse_nodes,
 )
 from rfl_torch.executor import Executor, make_executor
+from rfl_torch.explorer import Explorer
+from rfl_torch.free_ways import FreeWays, learn_free_ways
 from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.looks import BATCH, find_looks, look_radius
 from rfl_torch.memory import Memory, join
@@ -71,6 +73,9 @@ MOST_SAMPLES = 256
 MOST_PLACES = 2
 """Times as many nodes as by the grid's places that places by a track may make that wasn't seen to
 come back: with more, the actions don't add up to positions."""
+
+MOST_DIMENSIONS = 3
+"""Of actions, for a robot that is lost to explore: a lattice of more has too many cells."""
 
 MOST_ROUNDS = 8
 """Times that a repaired map is counted and its logs recognised anew, until all nodes are used."""
@@ -111,6 +116,8 @@ class Agent:
     """The logs, where they are gone back to: actions add up to positions, and all are laid out anew
     with what comes next; or the world isn't reversible, and motion is learned from them
     (`config.steers`)."""
+    free_ways: FreeWays | None
+    """What free ways look like, if actions add up to positions."""
     least_familiar: float
     """Tempered log-density [nat] under its node that an observation of a known place has."""
 
@@ -123,6 +130,7 @@ class Agent:
         """Know nothing yet."""
         self.record: list[learning.Progress] = []
         self.counts = self.statistics = self.memory = self.last_seen = None
+        self.free_ways = None
         self._motion: Motion | None = None
 
     # -- learning ---------------------------------------------------------------------------
@@ -183,6 +191,7 @@ class Agent:
             if adds_up and self.is_reversible:
                 nodes = [path.numpy() for path in paths]
                 self.memory = join(list(zip(nodes, seen, actions, strict=True)))
+                self.free_ways = self._learn_free_ways(track, seen, actions)
         else:
             self.statistics = self.hmm.e_step(observations, power)
         if monitor is not None:
@@ -286,7 +295,9 @@ class Agent:
             more = join([(path.numpy(), filled, self._unit_actions(log.actions))])
             memory = memory.plus(more, goes_on)
         seen, actions = memory.logs()
-        nodes = self._follow_track(seen, actions).split()
+        track = self._follow_track(seen, actions)
+        nodes = track.split()
+        self.free_ways = self._learn_free_ways(track, seen, actions)
         self.memory = memory._replace(node=repair.keep_numbers(np.concatenate(nodes), known))
         self._count(self.memory.paths(), seen)
         self._prepare_recognition()
@@ -454,6 +465,17 @@ class Agent:
         """Where logs without gaps went, and what looks they saw there."""
         looks = find_looks(seen, actions, self.look_radius)
         return places.follow_track(looks, seen, actions, self.look_radius)
+
+    def _learn_free_ways(
+        self,
+        track: places.Track,
+        seen: list[NDArray[np.float64]],
+        actions: list[NDArray[np.float32]],
+    ) -> FreeWays | None:
+        """What free ways look like, from where logs without gaps went; None in many dimensions."""
+        if actions[0].shape[1] > MOST_DIMENSIONS:
+            return None
+        return learn_free_ways(track.positions(), seen, track.shifts, actions)
 
     def _repair(
         self, observations: list[Tensor], paths: list[Tensor], track: places.Track
@@ -736,6 +758,16 @@ class Agent:
         twins = self.twins.indices[self.twins.indptr[likeliest] : self.twins.indptr[likeliest + 1]]
         return np.append(likeliest, twins).astype(np.int64)
 
+    def explorer(self, seed: int = 0) -> Explorer:
+        """What takes a robot to where it has seen nothing yet; see `search`.
+
+        Raises:
+            ValueError: if actions don't add up to positions, so that it could not tell.
+        """
+        if self.free_ways is None:
+            raise ValueError("the logs show no free ways: their actions don't add up to positions.")
+        return Explorer(*self.action_bounds, self.look_radius, self.free_ways, seed)
+
     def strangeness(self, normal: NDArray[np.float64], node: int) -> float:
         """How far an observation (D,) is from what a node looks like, in radii of a look.
 
@@ -827,6 +859,9 @@ class Agent:
         if self.memory is not None:
             memory = self.memory._asdict()
             state |= {f"memory.{name}": torch.from_numpy(value) for name, value in memory.items()}
+        if self.free_ways is not None:
+            state["free_ways.weight"] = torch.from_numpy(self.free_ways.weight)
+            state["free_ways.still"] = torch.tensor(self.free_ways.still, dtype=torch.float64)
         save_checkpoint(Path(path), {"agent": self.config.to_json(), "seed": self.seed}, state)
 
     @classmethod
@@ -878,6 +913,9 @@ class Agent:
         self.bank.load_state_dict(_with_prefix(state, "bank."))
         memory = {name: t.numpy() for name, t in _with_prefix(state, "memory.").items()}
         self.memory = Memory(**memory) if memory else None
+        if "free_ways.weight" in state:
+            weight, still = state["free_ways.weight"].numpy(), float(state["free_ways.still"])
+            self.free_ways = FreeWays(weight, still)
         self._prepare_recognition()
         self._prepare_planning()
         pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()

@@ -28,6 +28,11 @@ MEMORY_LAYOUT: Layout = {
     "memory.start": (torch.int64, "L"),
 }
 
+FREE_WAYS_LAYOUT: Layout = {
+    "free_ways.weight": (torch.float64, "JW"),
+    "free_ways.still": (torch.float64, ""),
+}
+
 LAYOUT: Layout = {
     "hmm.successor": (torch.int64, "NK"),
     "hmm.successor_mask": (torch.bool, "NK"),
@@ -94,6 +99,8 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
         layout |= {f"counts.{x}": (torch.float64, "ND") for x in ("weight", "first", "second")}
     if "memory.node" in state:
         layout |= MEMORY_LAYOUT
+    if "free_ways.weight" in state:
+        layout |= FREE_WAYS_LAYOUT
     layout |= BANK_LAYOUTS[config.controller]
     sizes = check_layout(state, layout)
     num_nodes, obs_dim, action_dim = (sizes[letter] for letter in "NDA")
@@ -125,9 +132,12 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
         "observation_period",
         "counts.weight",
         "look_radius",
+        "free_ways.still",
     ):
         if name in state and (state[name] < 0).any():
             raise ValueError(f"{name} has a number below zero")
+    if "free_ways.weight" in state and sizes["J"] != obs_dim + 1:
+        raise ValueError(f"free_ways.weight has {sizes['J']} rows, needs {obs_dim + 1}")
     if state["look_radius"] == 0:
         raise ValueError("look_radius is 0")
     factor = state["blame.factor"]

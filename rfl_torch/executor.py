@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfl_torch import inference
+from rfl_torch.explorer import Explorer
 from rfl_torch.innate import InnateController
 from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
-from rfl_torch.search import Search
+from rfl_torch.search import LookSearch
 from rfl_torch.senses import FEW, Sensors, apart, believed, sensible
 from rfl_torch.steering import SteeringExecutor
 
@@ -164,10 +165,13 @@ class BeliefExecutor:
         self._sight = sight
         self._approach_left = 0 if sight is None else APPROACH
         self.goal = int(goals[0])
-        self._search = Search(*agent.action_bounds, agent.look_radius, seed)
+        self._seed = seed
+        self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
+        self._explorer: Explorer | None = None
         self.is_familiar = True
         self._recent: deque[bool] = deque(maxlen=LONGEST_DOUBT)
-        self._unfamiliar = self._weak = 0
+        self._unfamiliar = self._weak = self._known = 0
+        self._was_known = False
         self._sensors = Sensors(agent.hmm.obs_dim)
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         # A goal that is a sight is any place that looks like it.
@@ -206,9 +210,9 @@ class BeliefExecutor:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action of this control step, (A,), inside the action space."""
-        normal = self._agent.normalize(observation)
-        normal = self._recognize(normal)
-        is_lost = self._unfamiliar >= LOST or self._astray > 0
+        self._sensed = sensible(self._agent.normalize(observation))
+        normal = self._recognize(self._sensed)
+        is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._explorer is not None
         is_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
         is_there = is_there and self._trusts_sight()
         if self.status == "running" and is_there:
@@ -226,7 +230,7 @@ class BeliefExecutor:
             self.recovering = True
             self._next = -1
             if self._unfamiliar <= LONGEST_SEARCH:
-                return self._search.act(normal)
+                return self._search_map(normal)
             self.status = "gave_up"
             self.reason = f"no node looks like anything seen in the last {LONGEST_SEARCH} steps"
         if self.status == "running":
@@ -241,6 +245,14 @@ class BeliefExecutor:
             self._babble_left -= 1
             return self._search.act(normal)
         return self._agent.control(normal, self._next)
+
+    def _search_map(self, normal: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Look for what is known."""
+        if self._agent.free_ways is None:
+            return self._search.act(normal)
+        if self._explorer is None:
+            self._explorer = self._agent.explorer(self._seed)
+        return self._explorer.act(self._sensors.working(self._sensed))
 
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar and not the first after many strange ones, or a jump."""
@@ -279,7 +291,7 @@ class BeliefExecutor:
 
         Returns the readings that are believed; a frame without any leaves what was known.
         """
-        sensed, before = sensible(normal), self.node
+        sensed, before = normal, self.node
         normal = self._sensors.working(sensed)
         if before < 0:
             self.belief = self._first_belief(normal)
@@ -294,6 +306,9 @@ class BeliefExecutor:
         self.belief = belief / belief.sum()
         self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
+        self._known = self._known + 1 if self.is_familiar else 0
+        if self._known >= CONFIRMED:
+            self._explorer, self._was_known = None, True  # back on the map
         if self.is_familiar:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
         if before >= 0 and not self._agent.near[before, self.node]:
@@ -321,10 +336,11 @@ class BeliefExecutor:
         self._recent.append(self.is_familiar)
         if self.is_familiar:
             self._unfamiliar = self._weak = 0
-        elif doubted < 1.0 and self._weak < LONGEST_DOUBT:
+        elif doubted < 1.0 and self._weak < LONGEST_DOUBT and self._was_known:
             self._unfamiliar, self._weak = 0, self._weak + 1
         else:
             self._unfamiliar += 1
+            self._was_known = self._was_known and self._unfamiliar < LOST
         return normal, log_emission
 
     def _first_belief(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -340,12 +356,12 @@ class BeliefExecutor:
         is_same = apart(seen, normal) <= self._agent.look_radius / LOOK_STEPS
         if not is_same or len(belief) != len(uniform):
             return uniform
-        self._knows_where = True
+        self._knows_where = self._was_known = True
         return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform
 
     def watch(self, observation: NDArray[np.float32]) -> None:
         """Follow where the robot is while someone else chooses its actions."""
-        self._recognize(self._agent.normalize(observation))
+        self._recognize(sensible(self._agent.normalize(observation)))
 
     def _cheapest_neighbor(self, node: int) -> int:
         """The neighbour over which the goal is cheapest; a node without any is its own."""

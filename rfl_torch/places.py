@@ -103,7 +103,11 @@ class Track(NamedTuple):
 
     def split(self) -> list[Labels]:
         """Nodes, one for each look at each place of the relaxed track, int64 (T+1,) each."""
-        return _gather(self.looks, relax(self.nodes, self.shifts, self.followed))
+        return _gather(self.looks, self.positions())
+
+    def positions(self) -> list[Array]:
+        """Of every observation on the relaxed track, in full actions, (T+1, A) each."""
+        return relax(self.nodes, self.shifts, self.followed)
 
 
 def follow_track(

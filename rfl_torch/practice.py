@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rfl_torch.innate import directions, done_row, env_action, nearest_direction
 from rfl_torch.planner import cost_to_go
-from rfl_torch.search import HOLD, Search
+from rfl_torch.search import HOLD, LookSearch
 from rfl_torch.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def practice(
     rng = np.random.default_rng(seed)
     run = _Run(env, num_steps, seed)
     goals = Goals(agent, strategy, rng)
-    search = Search(*agent.action_bounds, agent.look_radius, seed)
+    search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
     history: list[Attempt] = []
     node = 0
     bar = iter(progress(range(num_steps)))
@@ -229,7 +229,12 @@ def _pace(agent: "Agent") -> float:
 
 
 def _look_around(
-    agent: "Agent", run: _Run, goals: Goals, search: Search, executor: Any, rng: np.random.Generator
+    agent: "Agent",
+    run: _Run,
+    goals: Goals,
+    search: LookSearch,
+    executor: Any,
+    rng: np.random.Generator,
 ) -> None:
     """Do at this place what was not done there, and follow where it leads off the map."""
     low, high = agent.action_bounds

@@ -1,7 +1,7 @@
-"""Search where no map helps: at each look, try what was tried least there.
+"""Search where no map helps: off it, at its border, or where a controller holds the robot.
 
-A robot that is off its map, or at its border, has no plan. Random actions take it nowhere fast;
-counting which actions were tried at which look spreads it over the place like a flood.
+Random actions take it nowhere fast. Counting which actions were tried at which look spreads it over
+the place like a flood. Where actions add up to positions, `explorer` knows better.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ HOLD = 10
 """Steps that an action is held at one look at most."""
 
 
-class Search:
+class LookSearch:
     """Chooses actions that lead on from looks already seen.
 
     Args:

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from rfl_torch.explorer import Explorer
+from rfl_torch.free_ways import LONGEST, FreeWays, ways
+
+BOUNDS = (np.full(2, -1.0, np.float32), np.ones(2, np.float32))
+
+
+class Hook:
+    """A room shaped like a C, two arms of 60 x 20 full actions; a robot that sees 8 free ways."""
+
+    PARTS = (((0, 0), (60, 20)), ((0, 0), (20, 60)), ((0, 40), (60, 60)))
+
+    def __init__(self, position, noise=0.0):
+        self.position, self._noise = np.array(position, np.float64), noise
+        self._rng = np.random.default_rng(0)
+
+    def is_free(self, points):
+        inside = [((points >= low) & (points <= high)).all(-1) for low, high in self.PARTS]
+        return np.any(inside, 0)
+
+    def see(self):
+        reach = np.arange(0, LONGEST, 0.25)
+        free = self.is_free(self.position + ways(2)[:, None] * reach[:, None])
+        length = np.where(free.all(1), LONGEST, reach[free.argmin(1)]) / LONGEST
+        return length * (1 + self._noise * self._rng.uniform(-1, 1, length.shape))
+
+    def do(self, action):
+        for axis in range(2):  # as far as there is room
+            for share in (1.0, 0.5, 0.25, 0.0):
+                there = self.position.copy()
+                there[axis] += share * action[axis]
+                if self.is_free(there):
+                    self.position = there
+                    break
+
+
+def explorer(still=0.0):
+    sees_all = FreeWays(np.concatenate([LONGEST * np.eye(8), np.zeros((1, 8))]), still)
+    return Explorer(*BOUNDS, 2 * 0.6 / LONGEST, sees_all, 0)  # an action changes six ways of eight
+
+
+@pytest.mark.parametrize(("noise", "still"), [(0.0, 0.0), (0.05, 0.01)])
+def test_an_explorer_goes_from_one_end_of_a_room_to_the_other(noise, still):
+    room, search = Hook((55, 10), noise), explorer(still)
+    num_steps = 0
+    while np.linalg.norm(room.position - (55, 50)) > 8 and num_steps < 400:
+        room.do(search.act(room.see()))
+        num_steps += 1
+    assert num_steps < 320  # 140 by the shortest way
+
+
+def test_an_explorer_knows_where_it_is_though_walls_stood_in_its_way():
+    room, search = Hook((30, 10)), explorer()
+    for _ in range(200):
+        room.do(search.act(room.see()))
+    search.act(room.see())
+    rest = np.array([30, 10]) + search.position - room.position
+    assert np.abs(rest).max() < 5  # a part of an action a wall
+
+
+def test_an_explorer_that_sees_nothing_of_free_ways_still_enters_new_cells():
+    room = Hook((55, 10))
+    search = Explorer(*BOUNDS, 2 * 0.6 / LONGEST, FreeWays(np.zeros((9, 8)), 0.0), 0)
+    entered = set()
+    for _ in range(300):
+        room.do(search.act(room.see()))
+        entered.add(tuple((room.position // 10).astype(int)))
+    assert len(entered) > 8  # of 32 squares of 10 x 10, where a random walk enters 4
+
+
+def test_an_explorer_does_without_missing_readings():
+    room, search = Hook((55, 10)), explorer()
+    for step in range(60):
+        seen = room.see()
+        seen[step % 8] = np.nan
+        action = search.act(seen)
+        assert np.isfinite(action).all()
+        assert (np.abs(action) <= 1).all()
+        room.do(action)
+    assert np.isfinite(search.act(np.full(8, np.nan))).all()
