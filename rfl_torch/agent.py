@@ -286,7 +286,7 @@ class Agent:
             more = join([(path.numpy(), filled, self._unit_actions(log.actions))])
             memory = memory.plus(more, goes_on)
         seen, actions = memory.logs()
-        nodes = self._follow_track(seen, actions).split()
+        nodes = self._follow_track(seen, actions, known[: memory.settled]).split()
         self.memory = memory._replace(node=repair.keep_numbers(np.concatenate(nodes), known))
         self._count(self.memory.paths(), seen)
         self._prepare_recognition()
@@ -297,6 +297,7 @@ class Agent:
         parts += [assign_reversed(*log, horizon) for log in recognised]
         self.samples = latest(concatenate(parts), MOST_SAMPLES)
         self._train_bank(self.samples)
+        self.memory = self.memory.thinned()
         return self.memory.node
 
     def _grow(self, logs: list[Trajectory]) -> NDArray[np.int64]:
@@ -449,11 +450,14 @@ class Agent:
         ]
 
     def _follow_track(
-        self, seen: list[NDArray[np.float64]], actions: list[NDArray[np.float32]]
+        self,
+        seen: list[NDArray[np.float64]],
+        actions: list[NDArray[np.float32]],
+        known: NDArray[np.int64] | None = None,
     ) -> places.Track:
         """Where logs without gaps went, and what looks they saw there."""
         looks = find_looks(seen, actions, self.look_radius)
-        return places.follow_track(looks, seen, actions, self.look_radius)
+        return places.follow_track(looks, seen, actions, self.look_radius, known)
 
     def _repair(
         self, observations: list[Tensor], paths: list[Tensor], track: places.Track
@@ -853,6 +857,8 @@ class Agent:
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         config = self.config
+        if "memory.node" in state:  # a file of before there was that number holds all steps
+            state.setdefault("memory.settled", torch.zeros((), dtype=torch.int64))
         sizes = check_state(state, config)
         self.hmm = GridHMM.of_state(
             config.shape, config.radius, config.metric, config.boundary, _with_prefix(state, "hmm.")
