@@ -28,8 +28,8 @@ class Memory(NamedTuple):
     action: float32 (M, A) in [0, 1]; the row at a log's last observation means nothing.
     node: int64 (M,).
     start: int64 (L,), where each log begins.
-    settled: int64 (), how many steps there were when some were left out last: of the logs that begin
-        among them, what is left is where its nodes are, whatever it looks like.
+    settled: int64 (), steps that were kept when some were left out last. Of the logs that begin
+        among them what is left is where its nodes are, whatever it looks like.
     """
 
     observation: NDArray[np.float32]

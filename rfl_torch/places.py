@@ -70,8 +70,8 @@ OLD = 300
 """Steps since a place was first come to, from which on it is old."""
 
 AGREED, AGREED_SHARE = 40, 0.8
-"""Steps at looks with old places of which such a share must agree on how far the track is off before
-it is moved."""
+"""Steps at looks with old places, and their share that must agree on how far the track is off,
+before it is moved."""
 
 AWAY = 100
 """Steps after which a look that is seen again is come back to."""
@@ -290,9 +290,9 @@ class KnownPlaces:
 def find_known_starts(known: Labels, shifts: list[Array]) -> list[Array]:
     """Where the logs begin of whose steps nodes (M,) are known, (A,) each; the first at 0.
 
-    All of them at once, by the shifts and by the nodes that they have in common. A log inside one of
-    several rooms that look the same can't be found by its looks. Those that have no node in common,
-    even by others, are out of each other's reach.
+    All of them at once, by the shifts and by the nodes that they have in common: a log inside one
+    of several rooms that look the same can't be found by its looks. Those that have no node in
+    common, even by others, are out of each other's reach.
     """
     length = [len(shift) + 1 for shift in shifts]
     log = np.repeat(np.arange(len(shifts)), length)
