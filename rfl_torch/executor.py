@@ -175,6 +175,8 @@ class BeliefExecutor:
         self._knows_where = not self._can_be_unsure
         self._astray = self._jumps = 0
         self._confirmed = CONFIRMED
+        self._landed, self._beyond = -1, np.empty(0, np.int64)
+        self._is_proving = False
         self._from = -1
         self._steps_left = 0
         self._failures = 0
@@ -231,6 +233,10 @@ class BeliefExecutor:
             self.reason = f"no node looks like anything seen in the last {LONGEST_SEARCH} steps"
         if self.status == "running":
             targets = self._goals if self._knows_where else self._agent.telling
+            seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
+            self._is_proving = self._landed >= 0 and (self._is_proving or seems_there)
+            if self._is_proving:
+                targets = self._beyond
             if targets is not self._targets:
                 self._head_for(targets)
             self._choose_next()
@@ -244,9 +250,34 @@ class BeliefExecutor:
 
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar and not the first after many strange ones, or a jump."""
-        if self._confirmed < CONFIRMED:
+        if self._confirmed < CONFIRMED or self._landed >= 0:
             return False
         return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)
+
+    def _ask_whether(self, before: int) -> None:
+        """Take note of whether a belief that jumped, or that a lost robot came by, is proved.
+
+        It is by a familiar sight beyond the surroundings of where it landed: what only looks right
+        looks right for as long as the robot stands there, and doesn't go on as the map says. At its
+        goal the robot goes there and comes back.
+
+        Args:
+            before: node of the last step; -1 if there is none.
+        """
+        near = self._agent.near
+        has_jumped = before >= 0 and not near[before, self.node]
+        if has_jumped:
+            self._confirmed = 0
+        elif self._confirmed < CONFIRMED:
+            self._confirmed = self._confirmed + 1 if self.is_familiar else 0
+        if has_jumped or self._unfamiliar >= LOST:
+            if self._landed != self.node:
+                self._landed = self.node
+                self._beyond = np.flatnonzero(~near[[self.node]].toarray()[0])
+        elif self._landed >= 0 and self.is_familiar and not near[self._landed, self.node]:
+            self._landed = -1
+        if not self._beyond.size:  # the map has nothing that could prove it
+            self._landed = -1
 
     def _ask_where(self, before: int, is_plain: bool) -> None:
         """Take note of whether the robot knows which of the places that look like this it is at.
@@ -296,10 +327,7 @@ class BeliefExecutor:
         self.node = int(self.belief.argmax())
         if self.is_familiar:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
-        if before >= 0 and not self._agent.near[before, self.node]:
-            self._confirmed = 0
-        elif self._confirmed < CONFIRMED:
-            self._confirmed = self._confirmed + 1 if self.is_familiar else 0
+        self._ask_whether(before)
         self._ask_where(before, bool(seen[self.node] >= self._agent.least_familiar))
         return normal
 
