@@ -108,9 +108,9 @@ class Agent:
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
     memory: Memory | None
-    """The logs, where they are gone back to: actions add up to positions, and all are laid out anew
-    with what comes next; or the world isn't reversible, and motion is learned from them
-    (`config.steers`)."""
+    """The logs, where they are gone back to: actions add up to positions, and what the map needs of
+    them is laid out anew with what comes next; or the world isn't reversible, and motion is learned
+    from them (`config.steers`)."""
     least_familiar: float
     """Tempered log-density [nat] under its node that an observation of a known place has."""
 
@@ -212,8 +212,9 @@ class Agent:
         is still there keeps its number. A log that begins with the very observation that the last
         one ended with goes on from it. Executors made before are of the old map: make new ones.
 
-        Where actions add up to positions, all logs are kept and laid out anew together: time and
-        memory grow with all steps so far, about 0.1 ms and 110 bytes for each in the maze.
+        Where actions add up to positions, the logs are kept and laid out anew together. What was
+        learned from and is shown often enough by later steps is left out, beyond 10,000 steps and
+        30 a node: time and memory grow with the map, about 0.1 ms and 110 bytes for each step kept.
 
         Raises:
             ValueError: if a log has other readings or actions than those learned from, or takes
@@ -259,7 +260,7 @@ class Agent:
 
     @property
     def has_track(self) -> bool:
-        """Whether the map is laid out by the track of all logs, which are kept."""
+        """Whether the map is laid out by the track of the logs, which are kept."""
         return self.is_reversible and self.memory is not None
 
     def _check_memory(self, num_steps: int) -> None:
@@ -273,7 +274,7 @@ class Agent:
         footprint.check(needed, f"taking {num_steps} steps into {num_nodes} nodes")
 
     def _lay_out(self, logs: list[Trajectory]) -> NDArray[np.int64]:
-        """Lay all logs out anew by looks and track; returns the path of the last one."""
+        """Lay all that is kept out anew by looks and track; returns the nodes of its steps."""
         assert self.memory is not None
         memory, known = self.memory, self.memory.node
         for log in logs:

@@ -55,8 +55,8 @@ LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
 
 CONFIRMED = 10
-"""Familiar steps in a row without a jump after which a belief that jumped is trusted: a wall that
-moved makes one room look like another for some steps."""
+"""Familiar steps in a row without a jump after which a belief that jumped may be trusted: a wall
+that moved makes one room look like another for some steps."""
 
 APPROACH = 20
 """Steps from a goal's node to the goal's own sight, to within a full action of it; then a sight
@@ -211,9 +211,8 @@ class BeliefExecutor:
         normal = self._agent.normalize(observation)
         normal = self._recognize(normal)
         is_lost = self._unfamiliar >= LOST or self._astray > 0
-        is_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
-        is_there = is_there and self._trusts_sight()
-        if self.status == "running" and is_there:
+        seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
+        if self.status == "running" and seems_there and self._trusts_sight():
             if self._sight is None or self._sight_away(normal) <= 1 / LOOK_STEPS:
                 self.status = "reached"
             elif self._approach_left > 0:
@@ -233,7 +232,6 @@ class BeliefExecutor:
             self.reason = f"no node looks like anything seen in the last {LONGEST_SEARCH} steps"
         if self.status == "running":
             targets = self._goals if self._knows_where else self._agent.telling
-            seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
             self._is_proving = self._landed >= 0 and (self._is_proving or seems_there)
             if self._is_proving:
                 targets = self._beyond
@@ -249,7 +247,7 @@ class BeliefExecutor:
         return self._agent.control(normal, self._next)
 
     def _trusts_sight(self) -> bool:
-        """Whether this sight is familiar and not the first after many strange ones, or a jump."""
+        """Whether this sight is familiar, not after many strange ones, and a jump was proved."""
         if self._confirmed < CONFIRMED or self._landed >= 0:
             return False
         return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)

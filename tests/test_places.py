@@ -333,9 +333,16 @@ def test_a_room_entered_later_is_not_taken_for_one_that_looks_the_same(late, hal
     assert agent.num_nodes < 1.15 * whole.num_nodes
 
 
-def test_an_agent_that_was_saved_between_lays_out_the_same(late, half_path, tmp_path):
+@pytest.mark.parametrize("least_steps", [memory_module.LEAST_STEPS, 500])
+def test_an_agent_that_was_saved_between_lays_out_the_same(
+    late, half_path, tmp_path, monkeypatch, least_steps
+):
+    """With all steps, or without those that the map does not need."""
+    monkeypatch.setattr(memory_module, "LEAST_STEPS", least_steps)
+    monkeypatch.setattr(memory_module, "STEPS_A_NODE", 8)
     (walk, step), whole = late, Agent.load(half_path)
     whole.partial_fit(part(walk.log, step, step + 200))
+    assert (whole.memory.settled > 0) == (least_steps < step) == (len(whole.memory.start) > 1)
     whole.save(tmp_path / "between.safetensors")
     again = Agent.load(tmp_path / "between.safetensors")
     for agent in (whole, again):
