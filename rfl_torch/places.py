@@ -313,7 +313,7 @@ def _agreed(missed: deque[tuple[int, Array, bool]]) -> Array | None:
     if len(missed) < AGREED:
         return None
     if sum(is_far for *_, is_far in missed) <= AGREED_SHARE * AGREED:
-        return None  # as the most would say below, yet fifty times as fast
+        return None  # the medians below say the same, and take fifty times as long
     off = np.array([own for _, own, _ in missed])
     drift = np.median(off, 0)
     is_alike = np.linalg.norm(off - drift, axis=1) < PLACE_STEPS / 2
