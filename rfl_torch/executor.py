@@ -237,6 +237,8 @@ class BeliefExecutor:
                 targets = self._beyond
             if targets is not self._targets:
                 self._head_for(targets)
+            if self._is_proving and not np.isfinite(self._cost_to_go[self.node]):
+                self._landed = -1  # no way leads to what could prove it
             self._choose_next()
         if self.status != "running":
             return self._agent.rest_action

@@ -5,6 +5,7 @@ import dataclasses
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.sparse import csr_array, diags_array
 
 import sims  # noqa: F401
 from experiments import faults
@@ -120,6 +121,19 @@ def test_a_robot_at_its_goal_that_its_belief_jumped_to_heads_beyond_and_back(age
         executor.act(sights[node])
         executor.act(sights[node])
     assert executor.path[-1] == 7
+
+
+def test_where_no_way_leads_beyond_the_goal_a_jump_is_believed_after_some_steps(agent, sights):
+    executor, way = agent.executor(7), way_beyond(agent, sights, 7)
+    around = diags_array(agent.near[[7]].toarray()[0].astype(np.float64))
+    executor._cost = csr_array(around @ agent.graph @ around)
+    executor._cost.eliminate_zeros()
+    executor._head_for(executor._goals)
+    for _ in range(5):
+        executor.act(sights[way[-1]])
+    for _ in range(2 * CONFIRMED):
+        executor.act(sights[7])
+    assert executor.status == "reached"
 
 
 def test_readings_that_do_not_fit_where_the_others_agree_are_left_out():
