@@ -495,10 +495,11 @@ PARTS = 10
 """Equal parts of a soak; the last ones are compared with the first but one: the first warms up."""
 
 MOST_GROWTH = 1.1
-"""Of step time, median of the last three parts over that of the second to fourth."""
+"""Of step time, and of the memory of what learns: median of the last three parts over that of the
+second to fourth."""
 
 MOST_MEMORY = 8.0
-"""MB more at the end than after the first part, of an execution; a practice learns."""
+"""MB more in the last three parts than in the second to fourth, of what doesn't learn."""
 
 
 class Part(NamedTuple):
@@ -541,16 +542,14 @@ def try_soak(config: Soak) -> bool:
     ]
     rows, is_good = [], True
     for name, parts in soaks.items():
-        early, late = (
-            float(np.median([part.microseconds for part in some]))
-            for some in (parts[1:4], parts[-3:])
+        (early, held), (late, holds) = (
+            np.median([part[:2] for part in some], 0) for some in (parts[1:4], parts[-3:])
         )
-        grown = parts[-1].megabytes - parts[0].megabytes
-        is_flat = late <= MOST_GROWTH * early and grown <= MOST_MEMORY
+        is_learning = name == "practice in the maze"
+        most = MOST_GROWTH * held if is_learning else held + MOST_MEMORY
         worst = max(part.worst_sum for part in parts)
-        # A practice in the maze learns: its map and its samples grow until they are full.
-        is_good &= (is_flat or name == "practice in the maze") and worst < 1e-9
-        memory = f"{parts[0].megabytes:.1f}", f"{parts[-1].megabytes:.1f}"
+        is_good &= bool(late <= MOST_GROWTH * early and holds <= most) and worst < 1e-9
+        memory = f"{held:.1f}", f"{holds:.1f}"
         goals = sum(part.goals for part in parts)
         nodes = f"{parts[0].num_nodes} to {parts[-1].num_nodes}"
         times = f"{early:.0f}", f"{late:.0f}"

@@ -113,9 +113,9 @@ class Agent:
     is_reversible: bool
     """Whether the log run backwards obeys the same controllers, with opposite actions."""
     memory: Memory | None
-    """The logs, where they are gone back to: actions add up to positions, and all are laid out anew
-    with what comes next; or the world isn't reversible, and motion is learned from them
-    (`config.steers`)."""
+    """The logs, where they are gone back to: actions add up to positions, and what the map needs of
+    them is laid out anew with what comes next; or the world isn't reversible, and motion is learned
+    from them (`config.steers`)."""
     free_ways: FreeWays | None
     """What free ways look like, if actions add up to positions."""
     least_familiar: float
@@ -221,8 +221,9 @@ class Agent:
         is still there keeps its number. A log that begins with the very observation that the last
         one ended with goes on from it. Executors made before are of the old map: make new ones.
 
-        Where actions add up to positions, all logs are kept and laid out anew together: time and
-        memory grow with all steps so far, about 0.1 ms and 110 bytes for each in the maze.
+        Where actions add up to positions, the logs are kept and laid out anew together. What was
+        learned from and is shown often enough by later steps is left out, beyond 10,000 steps and
+        30 a node: time and memory grow with the map, about 0.1 ms and 110 bytes for each step kept.
 
         Raises:
             ValueError: if a log has other readings or actions than those learned from, or takes
@@ -268,7 +269,7 @@ class Agent:
 
     @property
     def has_track(self) -> bool:
-        """Whether the map is laid out by the track of all logs, which are kept."""
+        """Whether the map is laid out by the track of the logs, which are kept."""
         return self.is_reversible and self.memory is not None
 
     def _check_memory(self, num_steps: int) -> None:
@@ -282,7 +283,7 @@ class Agent:
         footprint.check(needed, f"taking {num_steps} steps into {num_nodes} nodes")
 
     def _lay_out(self, logs: list[Trajectory]) -> NDArray[np.int64]:
-        """Lay all logs out anew by looks and track; returns the path of the last one."""
+        """Lay all that is kept out anew by looks and track; returns the nodes of its steps."""
         assert self.memory is not None
         memory, known = self.memory, self.memory.node
         for log in logs:
@@ -295,7 +296,7 @@ class Agent:
             more = join([(path.numpy(), filled, self._unit_actions(log.actions))])
             memory = memory.plus(more, goes_on)
         seen, actions = memory.logs()
-        track = self._follow_track(seen, actions)
+        track = self._follow_track(seen, actions, known[: memory.settled])
         nodes = track.split()
         self.free_ways = self._learn_free_ways(track, seen, actions)
         self.memory = memory._replace(node=repair.keep_numbers(np.concatenate(nodes), known))
@@ -308,6 +309,7 @@ class Agent:
         parts += [assign_reversed(*log, horizon) for log in recognised]
         self.samples = latest(concatenate(parts), MOST_SAMPLES)
         self._train_bank(self.samples)
+        self.memory = self.memory.thinned()
         return self.memory.node
 
     def _grow(self, logs: list[Trajectory]) -> NDArray[np.int64]:
@@ -460,11 +462,14 @@ class Agent:
         ]
 
     def _follow_track(
-        self, seen: list[NDArray[np.float64]], actions: list[NDArray[np.float32]]
+        self,
+        seen: list[NDArray[np.float64]],
+        actions: list[NDArray[np.float32]],
+        known: NDArray[np.int64] | None = None,
     ) -> places.Track:
         """Where logs without gaps went, and what looks they saw there."""
         looks = find_looks(seen, actions, self.look_radius)
-        return places.follow_track(looks, seen, actions, self.look_radius)
+        return places.follow_track(looks, seen, actions, self.look_radius, known)
 
     def _learn_free_ways(
         self,
@@ -888,6 +893,8 @@ class Agent:
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         config = self.config
+        if "memory.node" in state:  # a file of before there was that number holds all steps
+            state.setdefault("memory.settled", torch.zeros((), dtype=torch.int64))
         sizes = check_state(state, config)
         self.hmm = GridHMM.of_state(
             config.shape, config.radius, config.metric, config.boundary, _with_prefix(state, "hmm.")

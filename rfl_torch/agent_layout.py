@@ -26,6 +26,7 @@ MEMORY_LAYOUT: Layout = {
     "memory.action": (torch.float32, "QA"),
     "memory.node": (torch.int64, "Q"),
     "memory.start": (torch.int64, "L"),
+    "memory.settled": (torch.int64, ""),
 }
 
 FREE_WAYS_LAYOUT: Layout = {
@@ -116,6 +117,7 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
     if "memory.node" in state:
         check_index("memory.node", state["memory.node"], num_nodes)
         check_index("memory.start", state["memory.start"], sizes["Q"])
+        check_index("memory.settled", state["memory.settled"], sizes["Q"] + 1)
         begin = state["memory.start"].tolist()
         if begin[:1] != [0] or begin != sorted(set(begin)):
             raise ValueError("memory.start doesn't ascend from 0")

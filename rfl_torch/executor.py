@@ -56,8 +56,8 @@ LONGEST_SEARCH = 2000
 """Steps in a row without a familiar sight after which a goal is given up."""
 
 CONFIRMED = 10
-"""Familiar steps in a row without a jump after which a belief that jumped is trusted: a wall that
-moved makes one room look like another for some steps."""
+"""Familiar steps in a row without a jump after which a belief that jumped may be trusted: a wall
+that moved makes one room look like another for some steps."""
 
 APPROACH = 20
 """Steps from a goal's node to the goal's own sight, to within a full action of it; then a sight
@@ -179,6 +179,8 @@ class BeliefExecutor:
         self._knows_where = not self._can_be_unsure
         self._astray = self._jumps = 0
         self._confirmed = CONFIRMED
+        self._landed, self._beyond = -1, np.empty(0, np.int64)
+        self._is_proving = False
         self._from = -1
         self._steps_left = 0
         self._failures = 0
@@ -213,9 +215,8 @@ class BeliefExecutor:
         self._sensed = sensible(self._agent.normalize(observation))
         normal = self._recognize(self._sensed)
         is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._explorer is not None
-        is_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
-        is_there = is_there and self._trusts_sight()
-        if self.status == "running" and is_there:
+        seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
+        if self.status == "running" and seems_there and self._trusts_sight():
             if self._sight is None or self._sight_away(normal) <= 1 / LOOK_STEPS:
                 self.status = "reached"
             elif self._approach_left > 0:
@@ -235,8 +236,13 @@ class BeliefExecutor:
             self.reason = f"no node looks like anything seen in the last {LONGEST_SEARCH} steps"
         if self.status == "running":
             targets = self._goals if self._knows_where else self._agent.telling
+            self._is_proving = self._landed >= 0 and (self._is_proving or seems_there)
+            if self._is_proving:
+                targets = self._beyond
             if targets is not self._targets:
                 self._head_for(targets)
+            if self._is_proving and not np.isfinite(self._cost_to_go[self.node]):
+                self._landed = -1  # no way leads to what could prove it
             self._choose_next()
         if self.status != "running":
             return self._agent.rest_action
@@ -255,10 +261,35 @@ class BeliefExecutor:
         return self._explorer.act(self._sensors.working(self._sensed))
 
     def _trusts_sight(self) -> bool:
-        """Whether this sight is familiar and not the first after many strange ones, or a jump."""
-        if self._confirmed < CONFIRMED:
+        """Whether this sight is familiar, not after many strange ones, and a jump was proved."""
+        if self._confirmed < CONFIRMED or self._landed >= 0:
             return False
         return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)
+
+    def _ask_whether(self, before: int) -> None:
+        """Take note of whether a belief that jumped, or that a lost robot came by, is proved.
+
+        It is by a familiar sight beyond the surroundings of where it landed: what only looks right
+        looks right for as long as the robot stands there, and doesn't go on as the map says. At its
+        goal the robot goes there and comes back.
+
+        Args:
+            before: node of the last step; -1 if there is none.
+        """
+        near = self._agent.near
+        has_jumped = before >= 0 and not near[before, self.node]
+        if has_jumped:
+            self._confirmed = 0
+        elif self._confirmed < CONFIRMED:
+            self._confirmed = self._confirmed + 1 if self.is_familiar else 0
+        if has_jumped or self._unfamiliar >= LOST:
+            if self._landed != self.node:
+                self._landed = self.node
+                self._beyond = np.flatnonzero(~near[[self.node]].toarray()[0])
+        elif self._landed >= 0 and self.is_familiar and not near[self._landed, self.node]:
+            self._landed = -1
+        if not self._beyond.size:  # the map has nothing that could prove it
+            self._landed = -1
 
     def _ask_where(self, before: int, is_plain: bool) -> None:
         """Take note of whether the robot knows which of the places that look like this it is at.
@@ -311,10 +342,7 @@ class BeliefExecutor:
             self._explorer, self._was_known = None, True  # back on the map
         if self.is_familiar:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
-        if before >= 0 and not self._agent.near[before, self.node]:
-            self._confirmed = 0
-        elif self._confirmed < CONFIRMED:
-            self._confirmed = self._confirmed + 1 if self.is_familiar else 0
+        self._ask_whether(before)
         self._ask_where(before, bool(seen[self.node] >= self._agent.least_familiar))
         return normal
 

@@ -1,13 +1,24 @@
 """Recognised logs, kept in a row where learning more goes back to them.
 
 Motion is learned from them where a world can't run backwards (`motion`). Where actions add up to
-positions, all of them are laid out anew together with what comes next (`places`).
+positions, all of them are laid out anew together with what comes next (`places`): there, what was
+seen often enough since is left out, oldest first, so they grow with the map and not with time.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+LEAST_STEPS, STEPS_A_NODE = 10_000, 30
+"""Steps that are kept whatever they show, in all and for each node: 10,000 are laid out in half a
+second."""
+
+ENOUGH = 10
+"""Latest steps at a node that are kept in any case."""
+
+PIECE = 25
+"""Steps that are left out together. Where the robot then was is known from the nodes around."""
 
 
 class Memory(NamedTuple):
@@ -17,12 +28,15 @@ class Memory(NamedTuple):
     action: float32 (M, A) in [0, 1]; the row at a log's last observation means nothing.
     node: int64 (M,).
     start: int64 (L,), where each log begins.
+    settled: int64 (), steps that were kept when some were left out last. Of the logs that begin
+        among them what is left is where its nodes are, whatever it looks like.
     """
 
     observation: NDArray[np.float32]
     action: NDArray[np.float32]
     node: NDArray[np.int64]
     start: NDArray[np.int64]
+    settled: NDArray[np.int64] = np.zeros((), np.int64)
 
     def logs(self) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]]]:
         """Observations (T+1, E) and actions (T, A) of each log."""
@@ -40,6 +54,32 @@ class Memory(NamedTuple):
         is_same = observation.astype(np.float32) == self.observation[-1]
         return bool(is_there.any() and is_same[is_there].all())
 
+    def thinned(self) -> "Memory":
+        """This memory without the oldest pieces of what is more than the map needs.
+
+        A piece is left out if all its nodes are shown ENOUGH by the rest. A log that loses one from
+        its middle becomes two; the end of the last stays.
+        """
+        num_steps, left = len(self.node), np.bincount(self.node)
+        too_many = num_steps - max(LEAST_STEPS, STEPS_A_NODE * len(left))
+        if too_many <= 0:
+            return self
+        is_kept, begins = np.ones(num_steps, bool), np.zeros(num_steps, bool)
+        ends = np.append(self.start[1:], num_steps)
+        for begin, end in zip(self.start, ends, strict=True):
+            for piece in np.array_split(np.arange(begin, end), max(1, (end - begin) // PIECE)):
+                if too_many <= 0 or piece[-1] == num_steps - 1:
+                    break
+                node, count = np.unique(self.node[piece], return_counts=True)
+                if (left[node] - count >= ENOUGH).all():
+                    left[node] -= count
+                    too_many -= len(piece)
+                    is_kept[piece] = False
+        begins[self.start] = True
+        begins[1:] |= ~is_kept[:-1]
+        rows = (self.observation[is_kept], self.action[is_kept], self.node[is_kept])
+        return Memory(*rows, np.flatnonzero(begins[is_kept]), np.array(is_kept.sum()))
+
     def plus(self, more: "Memory", goes_on: bool = False) -> "Memory":
         """This memory with another's logs behind.
 
@@ -54,6 +94,7 @@ class Memory(NamedTuple):
             np.concatenate([self.action[:end], more.action]),
             np.concatenate([self.node[:end], more.node]),
             start,
+            self.settled,
         )
 
 

@@ -69,8 +69,9 @@ lies between two rooms that look the same."""
 OLD = 300
 """Steps since a place was first come to, from which on it is old."""
 
-AGREED = 40
-"""Steps at looks with old places that must agree on how far the track is off before it is moved."""
+AGREED, AGREED_SHARE = 40, 0.8
+"""Steps at looks with old places, and their share that must agree on how far the track is off,
+before it is moved."""
 
 AWAY = 100
 """Steps after which a look that is seen again is come back to."""
@@ -115,6 +116,7 @@ def follow_track(
     observations: list[Array],
     unit_actions: list[NDArray[np.float32]],
     radius: float,
+    known: Labels | None = None,
 ) -> Track:
     """Sum up the moves of some logs, and pull them together where places recur.
 
@@ -123,17 +125,20 @@ def follow_track(
         observations: (T+1, D) each, without missing readings.
         unit_actions: (T, A) each, in [0, 1].
         radius: of a look.
+        known: nodes of the first of these steps, from when they were laid out last. Their logs
+            begin where those say, the others where most of their looks were seen.
     """
     shifts = find_shifts(looks, observations, unit_actions, radius)
-    known = KnownPlaces(max(int(look.max()) for look in looks) + 1, shifts[0].shape[1])
-    parts = [
-        known.follow(look, shift, known.find_start(look, shift))
-        for look, shift in zip(looks, shifts, strict=True)
-    ]
+    come_to = KnownPlaces(max(int(look.max()) for look in looks) + 1, shifts[0].shape[1])
+    starts = [] if known is None or not len(known) else find_known_starts(known, shifts)
+    parts = []
+    for k, (look, shift) in enumerate(zip(looks, shifts, strict=True)):
+        start = starts[k] if k < len(starts) else come_to.find_start(look, shift)
+        parts.append(come_to.follow(look, shift, start))
     tracks, nodes = (list(part) for part in zip(*parts, strict=True))
     used, flat = np.unique(np.concatenate(nodes), return_inverse=True)  # some were moved away from
     nodes = np.split(flat, _starts(nodes)[1:])
-    comes_back = known.comes_back() and _shown(shifts, unit_actions) > SHOWN
+    comes_back = come_to.comes_back() and _shown(shifts, unit_actions) > SHOWN
     return Track(looks, shifts, tracks, nodes, len(used), comes_back)
 
 
@@ -199,7 +204,7 @@ class KnownPlaces:
         """Go along a log from `start` (A,); returns its track (T+1, A) and its places (T+1,)."""
         track, node = np.empty((len(look), len(start))), np.empty(len(look), np.int64)
         here = start
-        missed: deque[tuple[int, Array]] = deque(maxlen=AGREED)
+        missed: deque[tuple[int, Array, bool]] = deque(maxlen=AGREED)
         for t in range(len(look)):
             if t > 0:
                 here = here + shift[t - 1]
@@ -207,11 +212,11 @@ class KnownPlaces:
             if (off := self._off(own, here)) is not None:
                 if (drift := _agreed(missed)) is not None:
                     here = here + drift
-                    for step, _ in missed:
+                    for step, *_ in missed:
                         node[step], _ = self._visit(int(look[step]), track[step] + drift)
                     missed.clear()
                 else:
-                    missed.append((t, off))
+                    missed.append((t, off, bool(off @ off > (PLACE_STEPS / 2) ** 2)))
             if self._last[own] >= 0 and self._num_steps - self._last[own] > AWAY:
                 self._returns.append((self._away(own, here), self._away(own, track[t // 2])))
             self._last[own] = self._num_steps
@@ -286,14 +291,37 @@ class KnownPlaces:
         return np.average(offset[best], axis=0, weights=vote[best])
 
 
-def _agreed(missed: deque[tuple[int, Array]]) -> Array | None:
+def find_known_starts(known: Labels, shifts: list[Array]) -> list[Array]:
+    """Where the logs begin of whose steps nodes (M,) are known, (A,) each; the first at 0.
+
+    All of them at once, by the shifts and by the nodes that they have in common: a log inside one
+    of several rooms that look the same can't be found by its looks. Those that have no node in
+    common, even by others, are out of each other's reach.
+    """
+    length = [len(shift) + 1 for shift in shifts]
+    log = np.repeat(np.arange(len(shifts)), length)
+    own_places = np.arange(len(log) - len(known)) + known.max() + 1  # for each new step one
+    _, node = np.unique(np.concatenate([known, own_places]), return_inverse=True)
+    num_logs = int(log[len(known) - 1]) + 1
+    seen_by = csr_array((np.ones(len(log)), (log, node)))
+    _, part = connected_components(seen_by @ seen_by.T, directed=False)
+    far = 100 * PLACE_STEPS + sum(np.abs(shift).sum() for shift in shifts)
+    dim = shifts[0].shape[1]
+    apart = [np.full((num, dim), far * own) for num, own in zip(length, part, strict=True)]
+    tracks = relax(np.split(node, np.cumsum(length)[:-1]), shifts, apart)
+    return [track[0] - tracks[0][0] for track in tracks[:num_logs]]
+
+
+def _agreed(missed: deque[tuple[int, Array, bool]]) -> Array | None:
     """How far a track is off by what the last steps missed, (A,); None if it isn't, or unclear."""
     if len(missed) < AGREED:
         return None
-    off = np.array([own for _, own in missed])
+    if sum(is_far for *_, is_far in missed) <= AGREED_SHARE * AGREED:
+        return None  # the medians below say the same, and take fifty times as long
+    off = np.array([own for _, own, _ in missed])
     drift = np.median(off, 0)
     is_alike = np.linalg.norm(off - drift, axis=1) < PLACE_STEPS / 2
-    return drift if np.linalg.norm(drift) > PLACE_STEPS and is_alike.mean() > 0.8 else None
+    return drift if np.linalg.norm(drift) > PLACE_STEPS and is_alike.mean() > AGREED_SHARE else None
 
 
 def relax(nodes: list[Labels], shifts: list[Array], tracks: list[Array]) -> list[Array]:

@@ -30,8 +30,8 @@ LEARN_EVERY = 500
 """Steps between two updates of what is known."""
 
 LEARN_SHARE = 0.05
-"""Where all logs are laid out anew, which takes the longer the more there are: steps between two
-updates at least, as a share of all so far."""
+"""Where the logs are laid out anew, which takes the longer the more is kept of them: steps between
+two updates at least, as a share of those laid out last."""
 
 LONGEST_WAY = 400
 """Steps after which a goal is let go."""

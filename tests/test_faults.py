@@ -5,6 +5,7 @@ import dataclasses
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.sparse import csr_array, diags_array
 
 import sims  # noqa: F401
 from experiments import faults
@@ -46,38 +47,93 @@ def test_a_turned_ring_is_reported_and_not_believed(agent, log, monkeypatch):
     assert tally.false == tally.never_lost == 0
 
 
-def test_a_familiar_sight_after_many_strange_ones_is_no_arrival_yet(agent):
-    """Its own sight must be a fifth of the last 60: twelve, after 60 strange ones."""
-    rng = np.random.default_rng(0)
-    goal = agent.raw_readings(agent.hmm.emission_mean[7].detach().numpy()).astype(np.float32)
+@pytest.fixture(scope="module")
+def sights(agent):
+    """What each node looks like."""
+    return agent.raw_readings(agent.hmm.emission_mean.detach().numpy()).astype(np.float32)
+
+
+def way_beyond(agent, sights, node):
+    """Nodes on the way from a node to one that is not near it."""
+    far = int(np.flatnonzero(~agent.near[[node]].toarray()[0])[0])
+    executor = agent.executor(far)
+    executor.act(sights[node])
+    return executor.path
+
+
+def stand_and_walk(executor, sights, way):
+    """Whether an arrival is said while the robot stands at its goal, and once it was elsewhere."""
+    for _ in range(3 * CONFIRMED):
+        executor.act(sights[way[0]])
+    assert executor.node == way[0]
+    at_once = executor.status
+    for node in (*way, *way[::-1], way[0], way[0]):
+        for _ in range(2):
+            executor.act(sights[node])
+    return at_once, executor.status
+
+
+def test_a_robot_that_was_lost_arrives_only_if_what_lies_beyond_its_goal_looks_right(agent, sights):
+    """What it sees may be a goal by chance, for as long as it stands there."""
+    rng, way = np.random.default_rng(0), way_beyond(agent, sights, 7)
     executor = agent.executor(7)
-    executor.act(goal)
+    executor.act(sights[7])
     assert executor.status == "reached"  # nothing strange was seen before
     executor = agent.executor(7)
     for _ in range(60):
         executor.act(rng.random(24).astype(np.float32) * agent.observation_scale.max())
     assert not executor.is_familiar
+    assert stand_and_walk(executor, sights, way) == ("running", "reached")
+
+
+def test_a_familiar_sight_after_many_strange_ones_is_no_arrival_yet(agent, sights):
+    """It and those before must be a fifth of the last 60: twelve, after 60 strange ones."""
+    rng = np.random.default_rng(0)
+    executor = agent.executor(7)
+    for _ in range(60):
+        executor.act(rng.random(24).astype(np.float32) * agent.observation_scale.max())
     said = []
     for _ in range(12):
-        executor.act(goal)
-        assert executor.is_familiar
-        said.append(executor.status)
-    assert said == ["running"] * 11 + ["reached"]
-    assert executor.node == 7
+        executor.act(sights[7])
+        executor._landed = -1  # as if it had been elsewhere
+        said.append(executor._trusts_sight())
+    assert said == [False] * 11 + [True]
 
 
-def test_a_belief_that_jumped_says_it_arrived_only_once_it_has_stayed_for_some_steps(agent):
-    sights = agent.raw_readings(agent.hmm.emission_mean.detach().numpy()).astype(np.float32)
-    far = int(np.flatnonzero(agent.near[[7]].toarray()[0] == 0)[0])
+def test_a_belief_that_jumped_arrives_only_if_what_lies_beyond_its_goal_looks_right(agent, sights):
+    way = way_beyond(agent, sights, 7)
     executor = agent.executor(7)
     for _ in range(5):
-        executor.act(sights[far])
-    assert executor.node == far
-    said = []
-    while not said or said[-1] == "running":
+        executor.act(sights[way[-1]])
+    assert executor.node == way[-1]
+    assert stand_and_walk(executor, sights, way) == ("running", "reached")
+
+
+def test_a_robot_at_its_goal_that_its_belief_jumped_to_heads_beyond_and_back(agent, sights):
+    executor = agent.executor(7)
+    way = way_beyond(agent, sights, 7)
+    for _ in range(5):
+        executor.act(sights[way[-1]])
+    for _ in range(3):
         executor.act(sights[7])
-        said += [executor.status] if executor.node == 7 else []
-    assert said == ["running"] * CONFIRMED + ["reached"]
+    assert not agent.near[7, executor.path[-1]]
+    for node in way:
+        executor.act(sights[node])
+        executor.act(sights[node])
+    assert executor.path[-1] == 7
+
+
+def test_where_no_way_leads_beyond_the_goal_a_jump_is_believed_after_some_steps(agent, sights):
+    executor, way = agent.executor(7), way_beyond(agent, sights, 7)
+    around = diags_array(agent.near[[7]].toarray()[0].astype(np.float64))
+    executor._cost = csr_array(around @ agent.graph @ around)
+    executor._cost.eliminate_zeros()
+    executor._head_for(executor._goals)
+    for _ in range(5):
+        executor.act(sights[way[-1]])
+    for _ in range(2 * CONFIRMED):
+        executor.act(sights[7])
+    assert executor.status == "reached"
 
 
 def test_readings_that_do_not_fit_where_the_others_agree_are_left_out():

@@ -1,6 +1,8 @@
 import numpy as np
+import pytest
 
-from rfl_torch.memory import join
+from rfl_torch import memory as memory_module
+from rfl_torch.memory import ENOUGH, PIECE, STEPS_A_NODE, join
 
 
 def log(rng, num_steps, first=None):
@@ -37,3 +39,52 @@ def test_a_log_that_goes_on_becomes_one_with_the_last():
     found, expected = memory.plus(join(parts[1:]), goes_on=True), join([first, whole])
     for own, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(own, other)
+
+
+@pytest.fixture
+def crowded(monkeypatch):
+    """Three logs that show each of ten nodes 200 times, and two more a few times, long ago."""
+    monkeypatch.setattr(memory_module, "LEAST_STEPS", 100)
+    rng = np.random.default_rng(0)
+    memory = join([log(rng, length - 1) for length in (1_000, 400, 600)])
+    node = rng.permutation(np.arange(2_000) % 10)
+    node[:8] = np.arange(8) % 2 + 10
+    return memory._replace(node=node)
+
+
+def test_thinned_memory_has_what_the_map_needs_and_its_latest(crowded):
+    thin = crowded.thinned()
+    most = STEPS_A_NODE * 12
+    assert most - 2 * PIECE < len(thin.node) <= most
+    assert (np.bincount(thin.node)[:10] >= ENOUGH).all()
+    np.testing.assert_array_equal(thin.node[:PIECE], crowded.node[:PIECE])
+    late = len(thin.node) - 75
+    np.testing.assert_array_equal(thin.observation[late:], crowded.observation[-75:])
+    assert thin.ends_with(crowded.observation[-1].astype(np.float64))
+    again = thin.thinned()
+    for own, other in zip(again, thin, strict=True):
+        np.testing.assert_array_equal(own, other)
+
+
+def test_what_is_left_of_a_log_is_as_it_was(crowded):
+    """Each log of the thinned memory is a stretch of one that there was, with its actions."""
+    thin = crowded.thinned()
+    row = {seen.tobytes(): k for k, seen in enumerate(crowded.observation)}
+    whole_seen, whole_done = crowded.logs()
+    for seen, actions, path in zip(*thin.logs(), thin.paths(), strict=True):
+        begin = row[seen[0].astype(np.float32).tobytes()]
+        whole = int(np.searchsorted(crowded.start, begin, "right")) - 1
+        own = slice(begin - crowded.start[whole], begin - crowded.start[whole] + len(seen))
+        np.testing.assert_array_equal(seen, whole_seen[whole][own])
+        np.testing.assert_array_equal(actions, whole_done[whole][own][: len(seen) - 1])
+        np.testing.assert_array_equal(path, crowded.node[begin : begin + len(seen)])
+
+
+def test_a_memory_that_the_map_needs_stays_whole():
+    """Few steps; and many nodes that were each seen a few times."""
+    rng = np.random.default_rng(0)
+    few, many = join([log(rng, 5_000)]), join([log(rng, 20_000)])
+    node = rng.permutation(np.arange(20_001) // (ENOUGH - 1))
+    for memory in (few, many._replace(node=node)):
+        for own, other in zip(memory.thinned(), memory, strict=True):
+            np.testing.assert_array_equal(own, other)

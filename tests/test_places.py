@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 
 import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory, places, record, repair
+from rfl_torch import memory as memory_module
 from rfl_torch.checkpoint import load_checkpoint
 from rfl_torch.looks import find_looks, look_radius
 
@@ -122,6 +123,35 @@ def test_logs_that_begin_anywhere_are_laid_on_one_another(walk):
     node = walk.nodes(3)
     assert walk.extent(node).max() < 120
     assert len(np.unique(node)) < 1.1 * len(np.unique(walk.nodes()))
+
+
+def test_pieces_of_what_was_laid_out_begin_where_they_did(walk):
+    """Most of 40 pieces begin inside a bay; every other one is gone."""
+    looks, seen, actions = (part[::2] for part in walk.parts(40))
+    whole = np.split(walk.nodes(), np.cumsum([len(look) for look in walk.parts(40)[0]])[:-1])
+    truth = np.split(walk.log.ground_truth, np.cumsum([len(x) for x in walk.parts(40)[0]])[:-1])
+    truth = np.concatenate(truth[::2])
+    known = np.concatenate(whole[::2])
+    extent = []
+    for nodes in (None, known):
+        track = places.follow_track(looks, seen, actions, walk.radius, nodes)
+        node = np.concatenate(track.split())
+        extent.append(max(np.ptp(truth[node == k], 0).max() for k in np.unique(node)))
+    assert extent[0] > 250  # by their looks, pieces in one bay are laid into the other
+    assert extent[1] < 120
+
+
+def test_known_logs_begin_where_their_nodes_say():
+    """Logs to and fro on two lines that have nothing in common, and one that is new."""
+    begins, once = [0, 5, 10, 500, 505], np.array([*range(12), *range(12, 0, -1)])
+    paths = [begin + once for begin in begins]
+    known = np.unique(np.concatenate(paths), return_inverse=True)[1]
+    shifts = [np.diff(path).astype(np.float64)[:, None] for path in [*paths, np.arange(9)]]
+    starts = np.concatenate(places.find_known_starts(known, shifts))
+    assert len(starts) == 5
+    np.testing.assert_allclose(starts[:3], begins[:3], atol=1e-3)
+    assert starts[4] - starts[3] == pytest.approx(5, abs=1e-3)
+    assert abs(starts[3]) > 100 * places.PLACE_STEPS
 
 
 def test_a_track_comes_back_where_actions_add_up(walk):
@@ -303,9 +333,16 @@ def test_a_room_entered_later_is_not_taken_for_one_that_looks_the_same(late, hal
     assert agent.num_nodes < 1.15 * whole.num_nodes
 
 
-def test_an_agent_that_was_saved_between_lays_out_the_same(late, half_path, tmp_path):
+@pytest.mark.parametrize("least_steps", [memory_module.LEAST_STEPS, 500])
+def test_an_agent_that_was_saved_between_lays_out_the_same(
+    late, half_path, tmp_path, monkeypatch, least_steps
+):
+    """With all steps, or without those that the map does not need."""
+    monkeypatch.setattr(memory_module, "LEAST_STEPS", least_steps)
+    monkeypatch.setattr(memory_module, "STEPS_A_NODE", 8)
     (walk, step), whole = late, Agent.load(half_path)
     whole.partial_fit(part(walk.log, step, step + 200))
+    assert (whole.memory.settled > 0) == (least_steps < step) == (len(whole.memory.start) > 1)
     whole.save(tmp_path / "between.safetensors")
     again = Agent.load(tmp_path / "between.safetensors")
     for agent in (whole, again):
@@ -315,6 +352,20 @@ def test_an_agent_that_was_saved_between_lays_out_the_same(late, half_path, tmp_
     first, second = (load_checkpoint(tmp_path / f"{x}.safetensors")[1] for x in ("whole", "again"))
     assert first.keys() == second.keys()
     assert all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+def test_practice_for_long_keeps_what_the_map_needs(plan, walk, tmp_path, monkeypatch):
+    """With room for 15 steps a node of the 25 that there would be, saved between."""
+    monkeypatch.setattr(memory_module, "LEAST_STEPS", 500)
+    monkeypatch.setattr(memory_module, "STEPS_A_NODE", 15)
+    agent, path = Agent(SMALL).fit(walk.log), tmp_path / "between.safetensors"
+    with gym.make("rfl/RangefinderMaze-v0", layout=plan) as env:
+        for part in range(3):
+            agent.practice(env, 1000, seed=part)
+            agent.save(path)
+            agent = Agent.load(path)
+    assert agent.memory.settled == len(agent.memory.node) < 1.3 * 15 * agent.num_nodes
+    assert walk.extent(agent.recognize(walk.log.observations)).max() < 120
 
 
 def test_practice_is_one_log_that_goes_on(plan, late, half_path):
