@@ -116,6 +116,8 @@ class Agent:
     """The logs, where they are gone back to: actions add up to positions, and what the map needs of
     them is laid out anew with what comes next; or the world isn't reversible, and motion is learned
     from them (`config.steers`)."""
+    positions: NDArray[np.float64] | None
+    """Of the nodes on the track, in full actions, (N, A), if actions add up to positions."""
     free_ways: FreeWays | None
     """What free ways look like, if actions add up to positions."""
     least_familiar: float
@@ -130,7 +132,7 @@ class Agent:
         """Know nothing yet."""
         self.record: list[learning.Progress] = []
         self.counts = self.statistics = self.memory = self.last_seen = None
-        self.free_ways = None
+        self.free_ways = self.positions = None
         self._motion: Motion | None = None
 
     # -- learning ---------------------------------------------------------------------------
@@ -186,12 +188,13 @@ class Agent:
         adds_up = track is not None and track.comes_back
         loss = self._learn_controllers(observations, actions, paths, adds_up)
         if track is not None and self.is_reversible:
-            paths = self._repair(observations, paths, track)
+            positions = track.positions()
+            paths = self._repair(observations, paths, track, positions)
             loss = self._learn_controllers(observations, actions, paths, adds_up)
             if adds_up and self.is_reversible:
                 nodes = [path.numpy() for path in paths]
                 self.memory = join(list(zip(nodes, seen, actions, strict=True)))
-                self.free_ways = self._learn_free_ways(track, seen, actions)
+                self._learn_land(track, positions, seen, actions)
         else:
             self.statistics = self.hmm.e_step(observations, power)
         if monitor is not None:
@@ -297,10 +300,11 @@ class Agent:
             memory = memory.plus(more, goes_on)
         seen, actions = memory.logs()
         track = self._follow_track(seen, actions, known[: memory.settled])
-        nodes = track.split()
-        self.free_ways = self._learn_free_ways(track, seen, actions)
+        positions = track.positions()
+        nodes = track.split(positions)
         self.memory = memory._replace(node=repair.keep_numbers(np.concatenate(nodes), known))
         self._count(self.memory.paths(), seen)
+        self._learn_land(track, positions, seen, actions)
         self._prepare_recognition()
         paths = [torch.from_numpy(path) for path in self.memory.paths()]
         recognised = self._note_paths([torch.from_numpy(x) for x in seen], actions, paths)
@@ -471,25 +475,32 @@ class Agent:
         looks = find_looks(seen, actions, self.look_radius)
         return places.follow_track(looks, seen, actions, self.look_radius, known)
 
-    def _learn_free_ways(
+    def _learn_land(
         self,
         track: places.Track,
+        positions: list[NDArray[np.float64]],
         seen: list[NDArray[np.float64]],
         actions: list[NDArray[np.float32]],
-    ) -> FreeWays | None:
-        """What free ways look like, from where logs without gaps went; None in many dimensions."""
+    ) -> None:
+        """Where the nodes are, and what free ways look like, from the logs in memory."""
         if actions[0].shape[1] > MOST_DIMENSIONS:
-            return None
-        return learn_free_ways(track.positions(), seen, track.shifts, actions)
+            return
+        assert self.memory is not None
+        self.positions = places.middles(self.memory.node, positions, self.num_nodes)
+        self.free_ways = learn_free_ways(positions, seen, track.shifts, actions)
 
     def _repair(
-        self, observations: list[Tensor], paths: list[Tensor], track: places.Track
+        self,
+        observations: list[Tensor],
+        paths: list[Tensor],
+        track: places.Track,
+        positions: list[NDArray[np.float64]],
     ) -> list[Tensor]:
         """Rebuild the map by looks and places; returns the logs' paths on the new one."""
         nodes = repair.split_by_place(track.looks, [path.numpy() for path in paths])
         most = MOST_PLACES * (1 + max(int(node.max()) for node in nodes))
         if track.comes_back or track.num_places <= most:
-            nodes = track.split()
+            nodes = track.split(positions)
         values = [sequence.numpy() for sequence in observations]
         for _ in range(MOST_ROUNDS):
             self._count(nodes, values)
@@ -763,15 +774,22 @@ class Agent:
         twins = self.twins.indices[self.twins.indptr[likeliest] : self.twins.indptr[likeliest + 1]]
         return np.append(likeliest, twins).astype(np.int64)
 
-    def explorer(self, seed: int = 0) -> Explorer:
-        """What takes a robot to where it has seen nothing yet; see `search`.
+    def explorer(self, seed: int = 0, node: int | None = None) -> Explorer:
+        """What takes a robot to where it has seen nothing yet.
+
+        Args:
+            seed: decides where nothing is left.
+            node: where the robot is, so that what the map knows is not new; None if it is lost.
 
         Raises:
             ValueError: if actions don't add up to positions, so that it could not tell.
         """
-        if self.free_ways is None:
+        if self.free_ways is None or self.positions is None:
             raise ValueError("the logs show no free ways: their actions don't add up to positions.")
-        return Explorer(*self.action_bounds, self.look_radius, self.free_ways, seed)
+        explorer = Explorer(*self.action_bounds, self.look_radius, self.free_ways, seed)
+        if node is not None:
+            explorer.know(self.positions - self.positions[node])
+        return explorer
 
     def strangeness(self, normal: NDArray[np.float64], node: int) -> float:
         """How far an observation (D,) is from what a node looks like, in radii of a look.
@@ -864,7 +882,8 @@ class Agent:
         if self.memory is not None:
             memory = self.memory._asdict()
             state |= {f"memory.{name}": torch.from_numpy(value) for name, value in memory.items()}
-        if self.free_ways is not None:
+        if self.free_ways is not None and self.positions is not None:
+            state["positions"] = torch.from_numpy(self.positions)
             state["free_ways.weight"] = torch.from_numpy(self.free_ways.weight)
             state["free_ways.still"] = torch.tensor(self.free_ways.still, dtype=torch.float64)
         save_checkpoint(Path(path), {"agent": self.config.to_json(), "seed": self.seed}, state)
@@ -922,7 +941,7 @@ class Agent:
         self.memory = Memory(**memory) if memory else None
         if "free_ways.weight" in state:
             weight, still = state["free_ways.weight"].numpy(), float(state["free_ways.still"])
-            self.free_ways = FreeWays(weight, still)
+            self.free_ways, self.positions = FreeWays(weight, still), state["positions"].numpy()
         self._prepare_recognition()
         self._prepare_planning()
         pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()

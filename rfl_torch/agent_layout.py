@@ -32,6 +32,7 @@ MEMORY_LAYOUT: Layout = {
 FREE_WAYS_LAYOUT: Layout = {
     "free_ways.weight": (torch.float64, "JW"),
     "free_ways.still": (torch.float64, ""),
+    "positions": (torch.float64, "NA"),
 }
 
 LAYOUT: Layout = {

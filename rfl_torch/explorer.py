@@ -107,6 +107,11 @@ class Explorer:
         self._seen = np.empty(0)
         self._run: _Run | None = None
 
+    def know(self, positions: Array) -> None:
+        """Take places (N, A), counted in full actions from here, for known: none is new."""
+        for cell in np.unique(_cell(positions), axis=0):
+            self._cells.enter(cell)
+
     def act(self, normal: Array) -> NDArray[np.float32]:
         """Return the action of this step, (A,), at a normalised observation (D,)."""
         self._follow(normal)
@@ -132,7 +137,7 @@ class Explorer:
         if self._did is not None:
             self._count(normal, self._did)
         self._seen = normal
-        if self._cells.enter(_cell(self.position)):
+        if self._cells.enter(_cell(self.position)) or self._did is None:
             self._look_around(normal)
 
     def _count(self, normal: NDArray[np.float64], did: NDArray[np.float64]) -> None:

@@ -102,13 +102,13 @@ class Track(NamedTuple):
     """Whether a look that is seen again after long is seen where it was, by moves that were asked
     for."""
 
-    def split(self) -> list[Labels]:
-        """Nodes, one for each look at each place of the relaxed track, int64 (T+1,) each."""
-        return _gather(self.looks, self.positions())
-
     def positions(self) -> list[Array]:
         """Of every observation on the relaxed track, in full actions, (T+1, A) each."""
         return relax(self.nodes, self.shifts, self.followed)
+
+    def split(self, positions: list[Array]) -> list[Labels]:
+        """Nodes, one for each look at each of the `positions`' places, int64 (T+1,) each."""
+        return _gather(self.looks, positions)
 
 
 def follow_track(
@@ -347,6 +347,14 @@ def relax(nodes: list[Labels], shifts: list[Array], tracks: list[Array]) -> list
     right[:num_steps] += LOOSE * track
     solved = spsolve(normal.tocsc(), right).reshape(size, -1)[:num_steps]
     return np.split(solved, _starts(nodes)[1:])
+
+
+def middles(node: Labels, positions: list[Array], num_nodes: int) -> Array:
+    """Mean position of the steps (T,) of each node, (N, A); 0 of one without."""
+    position = np.concatenate(positions)
+    total = np.zeros((num_nodes, position.shape[1]))
+    np.add.at(total, node, position)
+    return np.asarray(total / np.bincount(node, minlength=num_nodes).clip(1)[:, None])
 
 
 def _differences(before: Labels, after: Labels, size: int) -> csr_array:

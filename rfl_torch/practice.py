@@ -6,7 +6,7 @@ there. All that it saw and did goes into the map, the controllers and the costs 
 
     random          any node
     least_visited   the node that was seen least
-    frontier        the node with most actions never tried, that lead to no known node, for the way
+    frontier        the node with most actions that lead to no known node, for the way there
     progress        the node whose success rate, or lack of one, changes most
 """
 
@@ -15,8 +15,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from rfl_torch.explorer import Explorer
+from rfl_torch.free_ways import ways
 from rfl_torch.innate import directions, done_row, env_action, nearest_direction
+from rfl_torch.places import NODE_STEPS
 from rfl_torch.planner import cost_to_go
 from rfl_torch.search import HOLD, LookSearch
 from rfl_torch.trajectory import Trajectory
@@ -36,10 +40,16 @@ two updates at least, as a share of those laid out last."""
 LONGEST_WAY = 400
 """Steps after which a goal is let go."""
 
+BACK = 10
+"""Familiar sights in a row by which a walk in unknown land ends."""
+
 LOOK_AROUND = 30
 """Steps spent at a goal on what was tried least."""
 
-OFF_MAP = 60
+AHEAD = 8.0
+"""Full actions ahead of a node, along a way that looks free, where no node is: a frontier."""
+
+OFF_MAP = 200
 """Steps that a walk in unknown land may take on top before it is learned from."""
 
 FAST, SLOW = 0.5, 0.1
@@ -121,7 +131,19 @@ class Goals:
 
 
 def untried(agent: "Agent") -> NDArray[np.bool_]:
-    """Actions that were never tried at a node and lead to no neighbour that is known, (N, K)."""
+    """Actions at each node that lead to no node that is known, (N, K).
+
+    Where actions add up to positions, those that look free, lead to where no node is, and were not
+    done there for long. Else, or if there are none, those never done that lead to no neighbour.
+    """
+    if agent.positions is not None and agent.free_ways is not None:
+        ahead = agent.positions[:, None] + AHEAD * ways(agent.positions.shape[1])
+        away, _ = cKDTree(agent.positions).query(ahead)
+        means = agent.hmm.emission_mean.detach().numpy()
+        free = np.stack([agent.free_ways.at(mean) for mean in means])
+        is_open = (away > NODE_STEPS) & (free > AHEAD) & (agent.tried < HOLD)
+        if is_open.any():
+            return np.asarray(is_open)
     graph = agent.graph.tocoo()
     way, _ = nearest_direction(agent.ask(graph.row, graph.col))
     known = agent.tried > 0
@@ -238,23 +260,46 @@ def _look_around(
 ) -> None:
     """Do at this place what was not done there, and follow where it leads off the map."""
     low, high = agent.action_bounds
-    ways = directions(len(low))
+    unit = directions(len(low))
     left, most = LOOK_AROUND, LOOK_AROUND + OFF_MAP
+    node = executor.node
     while run.left > 0 and left > 0 and most > 0:
         choice = goals.try_out(executor.node)
         held = HOLD if choice is not None else 1
         for _ in range(held):
             if run.left == 0:
                 return
-            normal = agent.normalize(run.observation)
+            if executor.is_familiar:
+                node = executor.node
+            elif agent.free_ways is not None:
+                explorer = agent.explorer(int(rng.integers(2**31)), node)
+                num_steps, num_known = _explore(agent, run, executor, explorer, min(most, run.left))
+                most -= num_steps
+                left -= num_known
+                break
             if choice is None or not executor.is_familiar:
-                action = search.act(normal)
+                action = search.act(agent.normalize(run.observation))
             else:
-                action = (low + ways[choice] * (high - low)).astype(np.float32).clip(low, high)
+                action = (low + unit[choice] * (high - low)).astype(np.float32).clip(low, high)
             run.step(action)
             executor.watch(run.observation)
             most -= 1
             left -= executor.is_familiar
+
+
+def _explore(
+    agent: "Agent", run: _Run, executor: Any, explorer: Explorer, most: int
+) -> tuple[int, int]:
+    """Walk in unknown land until the map is come to again; steps taken, and those on the map."""
+    num_known = known = 0
+    for step in range(most):
+        run.step(explorer.act(agent.normalize(run.observation)))
+        executor.watch(run.observation)
+        num_known += executor.is_familiar
+        known = known + 1 if executor.is_familiar else 0
+        if known == BACK:
+            return step + 1, num_known
+    return most, num_known
 
 
 def _report(

@@ -80,3 +80,13 @@ def test_an_explorer_does_without_missing_readings():
         assert (np.abs(action) <= 1).all()
         room.do(action)
     assert np.isfinite(search.act(np.full(8, np.nan))).all()
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_an_explorer_leaves_what_is_known(side):
+    room, search = Hook((30, 10)), explorer()
+    x, y = np.meshgrid(np.arange(0, 31, 2), np.arange(-10, 11, 2), indexing="ij")
+    search.know(np.stack([-side * x.ravel(), y.ravel()], 1))
+    for _ in range(20):
+        room.do(search.act(room.see()))
+    assert side * (room.position[0] - 30) > 5

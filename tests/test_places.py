@@ -15,7 +15,10 @@ import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory, places, record, repair
 from rfl_torch import memory as memory_module
 from rfl_torch.checkpoint import load_checkpoint
+from rfl_torch.free_ways import ways
 from rfl_torch.looks import find_looks, look_radius
+from rfl_torch.practice import AHEAD, untried
+from sims.layouts import load_layout
 
 PLAN = {
     "size": [600, 480],
@@ -55,7 +58,8 @@ class Walk(NamedTuple):
         return places.follow_track(*self.parts(num), self.radius)
 
     def nodes(self, num=1):
-        return np.concatenate(self.track(num).split())
+        track = self.track(num)
+        return np.concatenate(track.split(track.positions()))
 
     def extent(self, node):
         """Largest distance [mm] between two steps of each node, along x or y."""
@@ -135,7 +139,7 @@ def test_pieces_of_what_was_laid_out_begin_where_they_did(walk):
     extent = []
     for nodes in (None, known):
         track = places.follow_track(looks, seen, actions, walk.radius, nodes)
-        node = np.concatenate(track.split())
+        node = np.concatenate(track.split(track.positions()))
         extent.append(max(np.ptp(truth[node == k], 0).max() for k in np.unique(node)))
     assert extent[0] > 250  # by their looks, pieces in one bay are laid into the other
     assert extent[1] < 120
@@ -390,6 +394,30 @@ def test_nodes_keep_their_numbers_and_places_when_more_is_learned(late, half_pat
         for k in np.intersect1d(before, after)
     ]
     assert np.quantile(moved, 0.9) < 20  # mm: half of a node
+
+
+def test_nodes_are_as_far_apart_as_they_were_seen(late, half_path):
+    """In full actions of 10 mm; a track that drifts is wrong by a node's length of 5."""
+    (walk, step), agent = late, Agent.load(half_path)
+    truth = walk.log.ground_truth[: step + 1] / 10
+    middle = places.middles(agent.memory.node, [truth], agent.num_nodes)
+    off = (agent.positions - agent.positions.mean(0)) - (middle - middle.mean(0))
+    assert np.median(np.linalg.norm(off, axis=1)) < 5
+
+
+def test_what_is_open_leads_to_where_no_node_is_and_mostly_through_no_wall(plan, late, half_path):
+    (walk, step), agent = late, Agent.load(half_path)
+    truth = walk.log.ground_truth[: step + 1] / 10
+    middle = places.middles(agent.memory.node, [truth], agent.num_nodes)
+    node, way = np.nonzero(untried(agent))
+    ahead = AHEAD * ways(2)[way]
+    away = np.linalg.norm(agent.positions[node] + ahead - agent.positions[:, None], axis=-1).min(0)
+    assert (away > places.NODE_STEPS).all()
+    room = load_layout(plan)
+    ends = zip(10 * middle[node], 10 * (middle[node] + ahead), strict=True)
+    is_free = [room.is_way_free(*both) for both in ends]
+    print(len(node), np.mean(is_free))
+    assert np.mean(is_free) > 0.5
 
 
 def test_a_goal_is_where_the_log_saw_what_is_most_like_it(late, half_path):
