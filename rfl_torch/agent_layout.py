@@ -148,8 +148,9 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
         raise ValueError(f"blame.factor has numbers outside 1 to {BLAME_LIMIT:g}")
     if state["hmm.emission_log_scale"].abs().max() > 100:
         raise ValueError("hmm.emission_log_scale has numbers beyond 100")
-    if state["hmm.emission_mean"].abs().max() > MAX_READING:
-        raise ValueError(f"hmm.emission_mean has numbers beyond {MAX_READING:g}")
+    for name in ("hmm.emission_mean", "free_ways.weight", "positions"):
+        if name in state and state[name].abs().max() > MAX_READING:
+            raise ValueError(f"{name} has numbers beyond {MAX_READING:g}")
     if (state["action_low"] > state["action_high"]).any():
         raise ValueError("action_low is above action_high")
     num_used = int((state["observation_scale"] > 0).sum())

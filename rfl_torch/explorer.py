@@ -55,6 +55,9 @@ MOST_LAG = 8
 MARGIN = 16
 """Cells of which nothing is known that the lattice has on each side."""
 
+KNOWN_REACH = 200.0
+"""Full actions from the start within which known places are taken note of, for memory's sake."""
+
 MOST_CELLS = 1_000_000
 """Of the lattice. A robot that has come farther begins anew."""
 
@@ -109,7 +112,8 @@ class Explorer:
 
     def know(self, positions: Array) -> None:
         """Take places (N, A), counted in full actions from here, for known: none is new."""
-        for cell in np.unique(_cell(positions), axis=0):
+        near = positions[np.abs(positions).max(1) <= KNOWN_REACH]
+        for cell in np.unique(_cell(near), axis=0):
             self._cells.enter(cell)
 
     def act(self, normal: Array) -> NDArray[np.float32]:
