@@ -33,7 +33,7 @@ from rfl_torch.monitor import TensorBoardMonitor
 from rfl_torch.practice import Attempt, Strategy
 
 PIECE = 2_000
-"""Steps between two states that are kept, about ten seconds in the maze. At a piece's end the
+"""Steps between two states that are kept, about six seconds in the maze. At a piece's end the
 agent is read back from its file, and what was noted of goals begins anew."""
 
 

@@ -66,9 +66,9 @@ class _Run(NamedTuple):
     """Steps in one direction, until it is known whether they moved the robot."""
 
     towards: tuple[int, bool]
-    seen: NDArray[np.float64]
+    seen: Array
     """Before the first one, (D,)."""
-    position: NDArray[np.float64]
+    position: Array
     num_steps: int
 
 
@@ -144,7 +144,7 @@ class Explorer:
         if self._cells.enter(_cell(self.position)) or self._did is None:
             self._look_around(normal)
 
-    def _count(self, normal: NDArray[np.float64], did: NDArray[np.float64]) -> None:
+    def _count(self, normal: Array, did: Array) -> None:
         """Add a step to the position; take back the last ones if nothing changed by them."""
         axis = int(np.abs(did).argmax())
         towards = (axis, bool(did[axis] > 0))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rfl_torch.executor import CONFIRMED
 from rfl_torch.explorer import Explorer
 from rfl_torch.free_ways import ways
 from rfl_torch.innate import directions, done_row, env_action, nearest_direction
@@ -39,9 +40,6 @@ two updates at least, as a share of those laid out last."""
 
 LONGEST_WAY = 400
 """Steps after which a goal is let go."""
-
-BACK = 10
-"""Familiar sights in a row by which a walk in unknown land ends."""
 
 LOOK_AROUND = 30
 """Steps spent at a goal on what was tried least."""
@@ -297,7 +295,7 @@ def _explore(
         executor.watch(run.observation)
         num_known += executor.is_familiar
         known = known + 1 if executor.is_familiar else 0
-        if known == BACK:
+        if known == CONFIRMED:
             return step + 1, num_known
     return most, num_known
 
