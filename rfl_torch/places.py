@@ -24,9 +24,9 @@ from scipy.sparse import csr_array, diags_array, eye_array, triu
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from rfl_torch.planner import look_alikes
+from rfl_torch.shifts import find_shifts
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -46,18 +46,16 @@ what is left is by where in the place the robot happened to stand."""
 NEAR = 3
 """Edges between two nodes that are one and the same place's surroundings."""
 
-NEAREST = 300
-"""Steps around a look that show which change of the readings goes with which action."""
-
-RIDGE = 1e-4
-"""Of that fit, as a share of the changes' total variance. A hundred times as much shortens the
-shifts of noisy readings until rooms are mixed."""
-
-PULL = 0.1
+PULL = 0.01
 """Share of the way to a known place's middle that the track is pulled when it comes there."""
 
-SHIFT_ERROR, PLACE_WIDTH = 0.2, 2.0
+SHIFT_ERROR, PLACE_WIDTH = 0.02, 2.0
 """Standard deviations, in full actions, of a shift and of a step from its place's middle."""
+
+PLAIN, LEAST_HOLD = 0.2, 0.03
+"""Share of a full action's usual change of the readings by which a move shows plainly, and what a
+place holds the track by where none shows. Halfway along a hall a look goes on for so long that the
+track shrank to a half of it; with no hold at all, a track that drifted stays so."""
 
 LOOSE = 1e-6
 """Weight of the track as followed, which holds what nothing else does."""
@@ -102,9 +100,13 @@ class Track(NamedTuple):
     """Whether a look that is seen again after long is seen where it was, by moves that were asked
     for."""
 
+    hold: Array
+    """How much each look holds the track along each dimension, (L, A), 1 where moves show."""
+
     def positions(self) -> list[Array]:
         """Of every observation on the relaxed track, in full actions, (T+1, A) each."""
-        return relax(self.nodes, self.shifts, self.followed)
+        holds = [self.hold[look] for look in self.looks]
+        return relax(self.nodes, self.shifts, self.followed, holds)
 
     def split(self, positions: list[Array]) -> list[Labels]:
         """Nodes, one for each look at each of the `positions`' places, int64 (T+1,) each."""
@@ -128,8 +130,9 @@ def follow_track(
         known: nodes of the first of these steps, from when they were laid out last. Their logs
             begin where those say, the others where most of their looks were seen.
     """
-    shifts = find_shifts(looks, observations, unit_actions, radius)
-    come_to = KnownPlaces(max(int(look.max()) for look in looks) + 1, shifts[0].shape[1])
+    shifts, shown, grip = find_shifts(looks, observations, unit_actions, radius)
+    hold = np.clip((grip / PLAIN) ** 2, LEAST_HOLD, 1.0)
+    come_to = KnownPlaces(*hold.shape)
     starts = [] if known is None or not len(known) else find_known_starts(known, shifts)
     parts = []
     for k, (look, shift) in enumerate(zip(looks, shifts, strict=True)):
@@ -138,47 +141,8 @@ def follow_track(
     tracks, nodes = (list(part) for part in zip(*parts, strict=True))
     used, flat = np.unique(np.concatenate(nodes), return_inverse=True)  # some were moved away from
     nodes = np.split(flat, _starts(nodes)[1:])
-    comes_back = come_to.comes_back() and _shown(shifts, unit_actions) > SHOWN
-    return Track(looks, shifts, tracks, nodes, len(used), comes_back)
-
-
-def _shown(shifts: list[Array], unit_actions: list[NDArray[np.float32]]) -> float:
-    """Share of the actions that the shifts are, 1 where all that was asked for was moved."""
-    asked = 2.0 * np.concatenate(unit_actions).astype(np.float64) - 1.0
-    return float(1 - ((asked - np.concatenate(shifts)) ** 2).sum() / max((asked**2).sum(), 1e-12))
-
-
-def find_shifts(
-    looks: list[Labels],
-    observations: list[Array],
-    unit_actions: list[NDArray[np.float32]],
-    radius: float,
-) -> list[Array]:
-    """How far each step went, in full actions, (T, A) for each log.
-
-    Around each look, actions are regressed on the changes of the readings, without a constant. A
-    step into a wall changes little: it counts as little, whatever was asked for. A reading that
-    jumps, as a ray does that slips past a corner, counts as one that changes by a look's radius,
-    and no step as more than a full action: what drifts 284 mm in 1,000 steps of a maze without
-    either, drifts 16 mm with both.
-    """
-    change = np.concatenate([np.diff(seen, axis=0) for seen in observations])
-    change = change.clip(-radius, radius)
-    middle = np.concatenate([(seen[1:] + seen[:-1]) / 2 for seen in observations])
-    action = np.concatenate([2.0 * actions - 1.0 for actions in unit_actions])
-    look = np.concatenate([look[:-1] for look in looks])
-    shift = np.empty_like(action)
-    for steps in np.split(look.argsort(kind="stable"), np.bincount(look).cumsum()[:-1]):
-        if not len(steps):
-            continue
-        away = cdist(np.median(middle[steps], 0)[None], middle, "cityblock")[0]
-        near = away.argpartition(min(NEAREST, len(away)) - 1)[:NEAREST]
-        product = change[near].T @ change[near]
-        weight = RIDGE * max(product.trace(), 1e-12) * np.eye(len(product))
-        gain = np.linalg.solve(product + weight, change[near].T @ action[near])
-        shift[steps] = change[steps] @ gain
-    shift /= np.maximum(1.0, np.abs(shift).max(1, keepdims=True))
-    return np.split(shift, np.cumsum([len(actions) for actions in unit_actions])[:-1])
+    comes_back = come_to.comes_back() and shown > SHOWN
+    return Track(looks, shifts, tracks, nodes, len(used), comes_back, hold)
 
 
 class KnownPlaces:
@@ -324,15 +288,22 @@ def _agreed(missed: deque[tuple[int, Array, bool]]) -> Array | None:
     return drift if np.linalg.norm(drift) > PLACE_STEPS and is_alike.mean() > AGREED_SHARE else None
 
 
-def relax(nodes: list[Labels], shifts: list[Array], tracks: list[Array]) -> list[Array]:
+def relax(
+    nodes: list[Labels],
+    shifts: list[Array],
+    tracks: list[Array],
+    holds: list[Array] | None = None,
+) -> list[Array]:
     """Tracks that agree best with the shifts and with a position for each place, by least squares.
 
     Args:
         nodes: places of every step of each log, (T+1,).
         shifts: (T, A) each.
         tracks: as followed, (T+1, A) each.
+        holds: how much each step's place holds it along each dimension, (T+1, A) each; 1 if None.
     """
     node, track = np.concatenate(nodes), np.concatenate(tracks)
+    hold = np.ones_like(track) if holds is None else np.concatenate(holds)
     num_steps, num_nodes = len(node), int(node.max()) + 1
     size = num_steps + num_nodes
     step = np.arange(num_steps)
@@ -340,12 +311,13 @@ def relax(nodes: list[Labels], shifts: list[Array], tracks: list[Array]) -> list
     chain = _differences(before, before + 1, size)
     place = _differences(num_steps + node, step, size)
     loose = np.concatenate([np.full(num_steps, LOOSE), np.zeros(num_nodes)])
-    normal = (
-        chain.T @ chain / SHIFT_ERROR**2 + place.T @ place / PLACE_WIDTH**2 + diags_array(loose)
-    )
+    stiff = chain.T @ chain / SHIFT_ERROR**2 + diags_array(loose)
     right = chain.T @ np.concatenate(shifts) / SHIFT_ERROR**2
     right[:num_steps] += LOOSE * track
-    solved = spsolve(normal.tocsc(), right).reshape(size, -1)[:num_steps]
+    solved = np.empty_like(track)
+    for axis, own in enumerate(hold.T):
+        normal = stiff + place.T @ diags_array(own / PLACE_WIDTH**2) @ place
+        solved[:, axis] = spsolve(normal.tocsc(), right[:, axis])[:num_steps]
     return np.split(solved, _starts(nodes)[1:])
 
 

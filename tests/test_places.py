@@ -108,21 +108,6 @@ def test_a_ring_is_one_ring_once_it_was_gone_round():
     assert len(np.unique(node)) < 1.6 * len(np.unique(ring.look))
 
 
-def test_shifts_are_what_was_moved_and_not_what_was_asked_for(walk):
-    (shift,) = places.find_shifts(*walk.parts(1), walk.radius)
-    moved = np.diff(walk.log.ground_truth, axis=0) / 10.0
-    was_stopped = (np.abs(moved - walk.log.actions) > 0.01).any(1)
-    assert was_stopped.mean() > 0.1
-    error = np.linalg.norm(shift - moved, axis=1)
-    asked = np.linalg.norm(walk.log.actions - moved, axis=1)
-    assert np.median(error[was_stopped]) < 0.2 * np.median(asked[was_stopped])
-    drift = (
-        np.linalg.norm((shift - moved).sum(0)),
-        np.linalg.norm((walk.log.actions - moved).sum(0)),
-    )
-    assert drift[0] < 10 < 30 < drift[1]
-
-
 def test_logs_that_begin_anywhere_are_laid_on_one_another(walk):
     node = walk.nodes(3)
     assert walk.extent(node).max() < 120

@@ -1,0 +1,68 @@
+"""What is counted as moved, against where the robot was."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sims  # noqa: F401
+from rfl_torch import record
+from rfl_torch.looks import find_looks, look_radius
+from rfl_torch.shifts import find_shifts
+
+STEP = 10.0
+"""Millimetres of a full action."""
+
+
+def walk_in(layout, num_steps, hold, **noise):
+    """Shifts of a log, (T, 2), its actions and true moves in full ones, and what was seen."""
+    with gym.make("rfl/RangefinderMaze-v0", layout=layout, **noise) as env:
+        log = record(env, num_steps, hold=hold, seed=0)
+    low = log.observations.min(0)
+    span = np.maximum(np.ptp(log.observations, axis=0), 1e-9)
+    seen = [((log.observations - low) / span).astype(np.float64)]
+    unit = [(log.actions + 1) / 2]
+    radius = look_radius(seen, unit)
+    (shift,), share, _ = find_shifts(find_looks(seen, unit, radius), seen, unit, radius)
+    return shift, log.actions, np.diff(log.ground_truth, axis=0) / STEP, share
+
+
+@pytest.mark.parametrize(("layout", "hold"), [("twins", 1), ("hall", 1), ("paper", 10)])
+def test_shifts_are_what_was_moved_and_not_what_was_asked_for(layout, hold):
+    """Within 0.01 of a full action a step; asked for was 0.01 to 0.1 more or less than moved."""
+    shift, asked, moved, _ = walk_in(layout, 6000, hold)
+    error = np.abs(shift - moved).mean()
+    assert error < 0.01
+    assert error < 0.3 * np.abs(asked - moved).mean()
+    assert np.linalg.norm((shift - moved).sum(0)) < 10
+
+
+def test_noise_is_told_from_walls():
+    shift, asked, moved, _ = walk_in("twins", 6000, 3, sensor_noise=0.05, motion_noise=0.1)
+    # A tenth of motion noise leaves 0.02 to 0.03 a step, which adds up to nothing.
+    assert np.abs(shift - moved).mean() < 0.05
+    was_stopped = (np.abs(moved - asked) > 0.4).any(1)
+    assert was_stopped.sum() > 200
+    error = np.linalg.norm(shift - moved, axis=1)[was_stopped]
+    assert np.median(error) < 0.3 * np.median(np.linalg.norm(asked - moved, axis=1)[was_stopped])
+
+
+def test_what_no_reading_shows_counts_as_done():
+    """One reading, of x alone, in a strip with walls in x: moves in y are never in sight."""
+    rng = np.random.default_rng(0)
+    action = rng.uniform(-1, 1, (4000, 2))
+    place = np.zeros((4001, 2))
+    for t in range(4000):
+        place[t + 1] = place[t] + action[t]
+        place[t + 1, 0] = place[t + 1, 0].clip(-20, 20)
+    seen = [(place[:, :1] + 20) / 40]
+    unit = [((action + 1) / 2).astype(np.float32)]
+    looks = [(seen[0][:, 0] * 19).round().astype(np.int64)]
+    (shift,), share, grip = find_shifts(looks, seen, unit, 0.05)
+    moved = np.diff(place, axis=0)
+    assert np.abs(shift[:, 1] - action[:, 1]).max() < 1e-6
+    # Shares are quarters, and a tenth of the steps end at a wall.
+    assert np.abs(shift[:, 0] - moved[:, 0]).mean() < 0.02
+    # Half of the actions' variance is in y, and shows nowhere.
+    assert 0.4 < share < 0.6
+    assert grip[:, 0].min() > 0.7
+    assert grip[:, 1].max() < 0.05
