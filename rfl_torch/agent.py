@@ -44,6 +44,7 @@ from rfl_torch.motion import Motion, remember, remember_more
 from rfl_torch.online_svr import SVRBank
 from rfl_torch.planner import look_alikes, seen_edges
 from rfl_torch.practice import Attempt, PracticeMonitor, Strategy, practice
+from rfl_torch.reckoning import Reckoning, mend
 from rfl_torch.resume import SavedLearning, identity
 from rfl_torch.senses import apart
 from rfl_torch.trajectory import Trajectory
@@ -118,6 +119,8 @@ class Agent:
     from them (`config.steers`)."""
     positions: NDArray[np.float64] | None
     """Of the nodes on the track, in full actions, (N, A), if actions add up to positions."""
+    reckoning: Reckoning | None
+    """Follows the robot by its actions, if they add up to positions."""
     free_ways: FreeWays | None
     """What free ways look like, if actions add up to positions."""
     least_familiar: float
@@ -179,7 +182,7 @@ class Agent:
             self.record = learning.learn(self.hmm, observations, stages, saved, record)
         learning.prune(self.hmm, observations, power)
         paths = self._recognize_logs(observations)
-        actions = [self._unit_actions(log.actions) for log in logs]
+        actions = [self.unit_actions(log.actions) for log in logs]
         seen = self._filled(observations, paths)
         self.look_radius = look_radius(seen, actions)
         track = (
@@ -210,7 +213,7 @@ class Agent:
             nodes: of every observation of each log, int64 (T+1,).
         """
         observations = [self.normalize(log.observations) for log in logs]
-        actions = [self._unit_actions(log.actions) for log in logs]
+        actions = [self.unit_actions(log.actions) for log in logs]
         paths = [torch.from_numpy(path) for path in self._count(nodes, observations)]
         self._prepare_recognition()
         self._learn_controllers([torch.from_numpy(x) for x in observations], actions, paths)
@@ -296,7 +299,7 @@ class Agent:
             if observations.isnan().any():
                 (path,) = self._recognize_logs([observations])
             (filled,) = self._filled([observations], [path])
-            more = join([(path.numpy(), filled, self._unit_actions(log.actions))])
+            more = join([(path.numpy(), filled, self.unit_actions(log.actions))])
             memory = memory.plus(more, goes_on)
         seen, actions = memory.logs()
         track = self._follow_track(seen, actions, known[: memory.settled])
@@ -322,7 +325,7 @@ class Agent:
         path = np.empty(0, np.int64)
         for log in logs:
             observations = self.normalize(log.observations)
-            actions = self._unit_actions(log.actions)
+            actions = self.unit_actions(log.actions)
             path = self._extend_map(observations, actions)
             known = np.where(np.isnan(observations), self._mean[path], observations)
             samples = (
@@ -497,11 +500,14 @@ class Agent:
         positions: list[NDArray[np.float64]],
     ) -> list[Tensor]:
         """Rebuild the map by looks and places; returns the logs' paths on the new one."""
-        nodes = repair.split_by_place(track.looks, [path.numpy() for path in paths])
-        most = MOST_PLACES * (1 + max(int(node.max()) for node in nodes))
-        if track.comes_back or track.num_places <= most:
-            nodes = track.split(positions)
         values = [sequence.numpy() for sequence in observations]
+        if track.comes_back:  # it tells more than sights: halfway along a hall they don't change
+            nodes = self._count(track.split(positions), values)
+            self._prepare_recognition()
+            return [torch.from_numpy(path) for path in nodes]
+        nodes = repair.split_by_place(track.looks, [path.numpy() for path in paths])
+        if track.num_places <= MOST_PLACES * (1 + max(int(node.max()) for node in nodes)):
+            nodes = track.split(positions)
         for _ in range(MOST_ROUNDS):
             self._count(nodes, values)
             nodes = [path.numpy() for path in self._recognize_logs(observations)]
@@ -624,6 +630,9 @@ class Agent:
         self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)
         self.map_cost = self.graph.data.copy()  # executors raise the graph's where they fail
         self.transition_in = self._with_hops(csr_array((prob, (rows, target)), shape=shape))
+        self.reckoning = None
+        if self.positions is not None:
+            self.reckoning = Reckoning(self.positions, self.edges, self.transition_in)
 
     def _steps_between(self, edges: csr_array) -> csr_array:
         """Control steps that each edge should take, (N, N) on the same edges.
@@ -720,8 +729,13 @@ class Agent:
         return readings * self.observation_scale[used] + self.observation_low[used]
 
     def recognize(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
-        """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,)."""
-        return inference.most_likely_path(self._uniform_chain, self.normalize(observations))
+        """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,).
+
+        What the map was laid out from is where the track has it.
+        """
+        normal = self.normalize(observations)
+        path = inference.most_likely_path(self._uniform_chain, normal)
+        return self.memory.remember(normal, path) if self.has_track and self.memory else path
 
     def executor(self, goal: Goal, seed: int = 0) -> Executor:
         """Make the object that drives to `goal`.
@@ -827,13 +841,37 @@ class Agent:
 
         With a `target` (D,), it heads for that observation instead.
         """
+        return self._raw_action(self._unit_control(normal, node, target))
+
+    def control_by_reckoning(
+        self, normal: NDArray[np.float64], node: int, here: int, where: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """`control`, and what the controller leaves out of the way goes by dead reckoning, (A,).
+
+        Args:
+            normal: what is seen, (D,).
+            node: to head for.
+            here: node at which the robot is.
+            where: its position, in full actions, (A,).
+        """
+        assert self.positions is not None
+        action, asked = (
+            2.0 * self._unit_control(seen, node).astype(np.float64) - 1.0
+            for seen in (normal, self._mean[here])
+        )
+        full = mend(action, asked, self.positions[node] - where)
+        return self._raw_action((full + 1.0) / 2.0)
+
+    def _unit_control(
+        self, normal: NDArray[np.float64], node: int, target: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float32]:
         mean = self._mean[node]
         observation = np.where(np.isnan(normal), mean, normal)
         target = mean if target is None else np.where(np.isnan(target), mean, target)
         row = np.concatenate([observation, target], dtype=np.float32, casting="same_kind")
-        return self._raw_action(self.bank.at(row, node))
+        return self.bank.at(row, node)
 
-    def _raw_action(self, unit: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _raw_action(self, unit: NDArray[np.floating]) -> NDArray[np.float32]:
         """From [0, 1] to the action space; what lies outside is shortened, not bent.
 
         A controller that overflows, far from all that it learned from, says nothing: rest.
@@ -845,7 +883,8 @@ class Agent:
         low, high = self.action_bounds
         return np.clip(low + (offset + 0.5) * (high - low), low, high).astype(np.float32)
 
-    def _unit_actions(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+    def unit_actions(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Actions (..., A) in the share of the action space that they are, [0, 1]."""
         low, high = self.action_bounds
         return ((actions - low) / np.where(high > low, high - low, 1.0)).astype(np.float32)
 

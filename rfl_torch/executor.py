@@ -89,8 +89,10 @@ class PathExecutor:
         self.is_familiar = True
         self.reason = ""
 
-    def watch(self, observation: NDArray[np.float32]) -> None:
-        """Follow where the robot is while someone else chooses its actions."""
+    def watch(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
+    ) -> None:
+        """Follow where the robot is while someone else chooses its actions; see BeliefExecutor."""
         normal = sensible(self._agent.normalize(observation))
         self._window.append(normal)
         self._recognize()
@@ -173,6 +175,9 @@ class BeliefExecutor:
         self._unfamiliar = self._weak = self._known = 0
         self._was_known = False
         self._sensors = Sensors(agent.hmm.obs_dim)
+        self._reckoning = agent.reckoning
+        self._did: NDArray[np.float64] | None = None
+        self._where = np.empty((0, 0)) if agent.positions is None else agent.positions
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         # A goal that is a sight is any place that looks like it.
         self._can_be_unsure = sight is None and len(agent.telling) < agent.num_nodes
@@ -212,6 +217,18 @@ class BeliefExecutor:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action of this control step, (A,), inside the action space."""
+        action = self._decide(observation)
+        self._note_action(action)
+        return action
+
+    def _note_action(self, action: NDArray[np.float32] | None) -> None:
+        """Remember what was done, in full actions."""
+        if action is None:
+            self._did = None
+        else:
+            self._did = 2.0 * self._agent.unit_actions(action).astype(np.float64) - 1.0
+
+    def _decide(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         self._sensed = sensible(self._agent.normalize(observation))
         normal = self._recognize(self._sensed)
         is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._explorer is not None
@@ -250,7 +267,11 @@ class BeliefExecutor:
         if self.recovering:
             self._babble_left -= 1
             return self._search.act(normal)
-        return self._agent.control(normal, self._next)
+        if self._reckoning is None:
+            return self._agent.control(normal, self._next)
+        return self._agent.control_by_reckoning(
+            normal, self._next, self.node, self._where[self.node]
+        )
 
     def _search_map(self, normal: NDArray[np.float64]) -> NDArray[np.float32]:
         """Look for what is known."""
@@ -327,7 +348,10 @@ class BeliefExecutor:
         if before < 0:
             self.belief = self._first_belief(normal)
         teleport = self._config.teleport
-        pushed = self._agent.transition_in @ self.belief
+        if self._reckoning is None or self._did is None:
+            pushed = self._agent.transition_in @ self.belief
+        else:
+            pushed, self._where = self._reckoning.push(self.belief, self._where, self._did)
         predicted = (1 - teleport) * pushed + teleport / len(pushed)
         log_emission = seen = self._agent.log_emission(normal)
         if not np.isnan(normal).all():
@@ -387,8 +411,16 @@ class BeliefExecutor:
         self._knows_where = self._was_known = True
         return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform
 
-    def watch(self, observation: NDArray[np.float32]) -> None:
-        """Follow where the robot is while someone else chooses its actions."""
+    def watch(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
+    ) -> None:
+        """Follow where the robot is while someone else chooses its actions.
+
+        Args:
+            observation: what is seen now, (D,).
+            action: what was done since the last observation, (A,); None if that isn't known.
+        """
+        self._note_action(action)
         self._recognize(sensible(self._agent.normalize(observation)))
 
     def _cheapest_neighbor(self, node: int) -> int:

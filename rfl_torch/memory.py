@@ -48,6 +48,24 @@ class Memory(NamedTuple):
         """Nodes (T+1,) of each log."""
         return np.split(self.node, self.start[1:])
 
+    def remember(
+        self, observations: NDArray[np.float64], path: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """A path (T,) with what is remembered in place of what was made of the observations (T, E).
+
+        Of the steps that saw the very same, the one is meant that goes on from the last.
+        """
+        steps: dict[bytes, list[int]] = {}
+        for step, seen in enumerate(self.observation):
+            steps.setdefault(seen.tobytes(), []).append(step)
+        remembered, step = path.copy(), -2
+        for t, seen in enumerate(observations.astype(np.float32)):
+            same = steps.get(seen.tobytes())
+            step = -2 if same is None else step + 1 if step + 1 in same else same[0]
+            if same is not None:
+                remembered[t] = self.node[step]
+        return remembered
+
     def ends_with(self, observation: NDArray[np.float64]) -> bool:
         """Whether the readings (E,) that are there are those of the last step."""
         is_there = ~np.isnan(observation)

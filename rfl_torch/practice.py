@@ -280,7 +280,7 @@ def _look_around(
             else:
                 action = (low + unit[choice] * (high - low)).astype(np.float32).clip(low, high)
             run.step(action)
-            executor.watch(run.observation)
+            executor.watch(run.observation, action)
             most -= 1
             left -= executor.is_familiar
 
@@ -291,8 +291,9 @@ def _explore(
     """Walk in unknown land until the map is come to again; steps taken, and those on the map."""
     num_known = known = 0
     for step in range(most):
-        run.step(explorer.act(agent.normalize(run.observation)))
-        executor.watch(run.observation)
+        action = explorer.act(agent.normalize(run.observation))
+        run.step(action)
+        executor.watch(run.observation, action)
         num_known += executor.is_familiar
         known = known + 1 if executor.is_familiar else 0
         if known == CONFIRMED:

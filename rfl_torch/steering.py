@@ -205,8 +205,10 @@ class SteeringExecutor:
         action = low + self._motion.choices[self._last] * (high - low)
         return np.clip(action, low, high).astype(np.float32)
 
-    def watch(self, observation: NDArray[np.float32]) -> None:
-        """Follow where the robot is while someone else chooses its actions."""
+    def watch(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
+    ) -> None:
+        """Follow where the robot is while someone else chooses its actions; see BeliefExecutor."""
         normal = self._agent.normalize(observation)
         now = self._recognize(normal)
         self.is_familiar = self._agent.strangeness(now, self.node) <= 1.0
