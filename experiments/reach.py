@@ -23,6 +23,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 import sims
@@ -34,6 +35,10 @@ from rfl_torch.practice import Strategy
 
 PEER_HORIZON = 100
 """Steps of the peer's episodes."""
+
+SAME_SIGHT, SIGHT_SPACING = 0.015, 5.0
+"""Mean absolute difference of ranges, half a full step's, within which places look the same, and
+millimetres between the places that are compared."""
 
 PEER_NEAR = 0.03
 """Mean absolute difference of ranges within which the peer's goal counts as reached in training:
@@ -108,6 +113,7 @@ def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[
     with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
         judge = Judge(env, layout, seed, config.trials)
         yield judge.random_walk()
+        yield judge.best_by_sight()
         for name, times, hold, choices in (
             ("paper", 1, 1, AgentConfig.paper()),
             ("default, independent actions", 1, 1, AgentConfig()),
@@ -224,6 +230,25 @@ class Judge:
         """Let `act(observation, goal) -> action` do the places; near at any time counts."""
         places = _share([self._comes_near(task, act) for task in self.places])
         return Row(name, self._layout, self._seed, num_steps, seconds, None, places, np.nan, np.nan)
+
+    def best_by_sight(self) -> Row:
+        """What nobody surpasses in the mean who knows the room and is told what a place looks like.
+
+        Several bays that look the same, or all of a hall from whose middle nothing is in sight,
+        fit the goal: the best is to stop where most of what fits is near.
+        """
+        cells = scoring.maze_layout(self._env).free_cells(SIGHT_SPACING)
+        sights = np.stack(
+            [self._env.reset(options={MAZE.reset_option: tuple(cell)})[0] for cell in cells]
+        )
+        best = 0.0
+        for task in self.places:
+            assert task.target is not None
+            fits = np.abs(sights - task.goal).mean(1) <= SAME_SIGHT
+            tree = cKDTree(np.concatenate([cells[fits], task.target[None]]))
+            best += max(len(near) for near in tree.query_ball_tree(tree, PLACE_TOLERANCE)) / tree.n
+        places = wilson(round(best), len(self.places))
+        return Row("best by sight", self._layout, self._seed, 0, 0.0, None, places, np.nan, np.nan)
 
     def random_walk(self) -> Row:
         """Held random actions."""

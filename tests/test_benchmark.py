@@ -3,10 +3,11 @@
 import importlib.util
 import os
 
+import gymnasium as gym
 import pytest
 import torch
 
-from experiments import benchmark
+from experiments import benchmark, reach
 
 
 @pytest.fixture(autouse=True)
@@ -89,3 +90,11 @@ def test_em_times_the_engine_against_two_matrix_products(monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     products = next(line for line in lines if line.startswith("two float32"))
     assert products.split()[-1] == "1.00"
+
+
+@pytest.mark.parametrize(("layout", "least", "most"), [("paper", 20, 20), ("twins", 8, 16)])
+def test_a_sight_tells_a_place_unless_another_looks_the_same(layout, least, most):
+    """Of 20 places; in `twins` half are in bays of which four look alike."""
+    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
+        row = reach.Judge(env, layout, 0, 20).best_by_sight()
+    assert least <= row.places.successes <= most
