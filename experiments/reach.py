@@ -32,6 +32,7 @@ from experiments.scoring import MAZE, PLACE_TOLERANCE, Share, Task, wilson
 from rfl_torch import Agent, AgentConfig, InnateController, Trajectory, record
 from rfl_torch.innate import action_bounds
 from rfl_torch.practice import Strategy
+from sims.maze import STEP_LENGTH
 
 PEER_HORIZON = 100
 """Steps of the peer's episodes."""
@@ -186,8 +187,9 @@ def know_places(agent: Agent, log: Trajectory, seed: int) -> Agent:
     oracle = Agent(agent.config, agent.seed)
     oracle.__dict__ |= {name: value for name, value in agent.__dict__.items() if name != "hmm"}
     oracle.hmm = type(agent.hmm)((2, 2), observations.shape[1])
-    oracle.learn_from_labels([log], [node.astype(np.int64)])
-    return oracle
+    return oracle.learn_from_labels(
+        [log], [node.astype(np.int64)], [log.ground_truth / STEP_LENGTH]
+    )
 
 
 # -- judging ------------------------------------------------------------------------------------

@@ -197,7 +197,7 @@ class Agent:
             if adds_up and self.is_reversible:
                 nodes = [path.numpy() for path in paths]
                 self.memory = join(list(zip(nodes, seen, actions, strict=True)))
-                self._learn_land(track, positions, seen, actions)
+                self._learn_land(self.memory.node, positions, track.shifts, seen, actions)
         else:
             self.statistics = self.hmm.e_step(observations, power)
         if monitor is not None:
@@ -205,18 +205,30 @@ class Agent:
         self._prepare_planning()
         return self
 
-    def learn_from_labels(self, logs: list[Trajectory], nodes: list[NDArray[np.int64]]) -> "Agent":
+    def learn_from_labels(
+        self,
+        logs: list[Trajectory],
+        nodes: list[NDArray[np.int64]],
+        positions: list[NDArray[np.float64]] | None = None,
+    ) -> "Agent":
         """Take labelled logs for the map's nodes, as from an oracle, and learn controllers.
 
         Args:
             logs: what `fit` learned the spaces from.
             nodes: of every observation of each log, int64 (T+1,).
+            positions: of every observation, in full actions, (T+1, A) for each log, if actions add
+                up to positions.
         """
+        self.memory = self.free_ways = self.positions = self.last_seen = None
         observations = [self.normalize(log.observations) for log in logs]
         actions = [self.unit_actions(log.actions) for log in logs]
         paths = [torch.from_numpy(path) for path in self._count(nodes, observations)]
         self._prepare_recognition()
         self._learn_controllers([torch.from_numpy(x) for x in observations], actions, paths)
+        if positions is not None:
+            shifts = [np.diff(position, axis=0) for position in positions]
+            labels = torch.cat(paths).numpy()
+            self._learn_land(labels, positions, shifts, observations, actions)
         self._prepare_planning()
         return self
 
@@ -307,7 +319,7 @@ class Agent:
         nodes = track.split(positions)
         self.memory = memory._replace(node=repair.keep_numbers(np.concatenate(nodes), known))
         self._count(self.memory.paths(), seen)
-        self._learn_land(track, positions, seen, actions)
+        self._learn_land(self.memory.node, positions, track.shifts, seen, actions)
         self._prepare_recognition()
         paths = [torch.from_numpy(path) for path in self.memory.paths()]
         recognised = self._note_paths([torch.from_numpy(x) for x in seen], actions, paths)
@@ -480,17 +492,17 @@ class Agent:
 
     def _learn_land(
         self,
-        track: places.Track,
+        node: NDArray[np.int64],
         positions: list[NDArray[np.float64]],
+        shifts: list[NDArray[np.float64]],
         seen: list[NDArray[np.float64]],
         actions: list[NDArray[np.float32]],
     ) -> None:
-        """Where the nodes are, and what free ways look like, from the logs in memory."""
+        """Where the nodes are, and what free ways look like, by logs whose nodes are known."""
         if actions[0].shape[1] > MOST_DIMENSIONS:
             return
-        assert self.memory is not None
-        self.positions = places.middles(self.memory.node, positions, self.num_nodes)
-        self.free_ways = learn_free_ways(positions, seen, track.shifts, actions)
+        self.positions = places.middles(node, positions, self.num_nodes)
+        self.free_ways = learn_free_ways(positions, seen, shifts, actions)
 
     def _repair(
         self,
