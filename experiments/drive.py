@@ -171,8 +171,8 @@ class Drive:
     def _act(self) -> NDArray[np.float32]:
         """Decide what to do now; without a goal, nothing."""
         if self.goal is None:
-            self.executor.watch(self.observation)
             action: NDArray[np.float32] = self.agent.rest_action
+            self.executor.watch(self.observation, action)
         else:
             action = self.executor.act(self.observation)
         is_under_way = self.goal is not None and self.executor.status == "running"
