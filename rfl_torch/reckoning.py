@@ -31,6 +31,9 @@ SLIP = 0.0005
 LEAST_BELIEF = 1e-6
 """Of a node, for its share to be pushed on."""
 
+ANYWHERE = 1e-9
+"""Belief up to which a node is taken to be at its middle: a robot that was put there can be."""
+
 STEPS_ON = 2
 """Edges that one move takes a robot over at most."""
 
@@ -54,8 +57,8 @@ class Reckoning:
         slipped = SLIP * (self._slipping @ belief)
         pushed, came = _push(belief, where + move, self.positions, self._first, self._around)
         pushed, came = (1 - SLIP) * pushed + slipped, (1 - SLIP) * came
-        came += slipped[:, None] * self.positions
-        came /= np.maximum(pushed, np.finfo(np.float64).tiny)[:, None]
+        came += (slipped[:, None] + ANYWHERE) * self.positions
+        came /= pushed[:, None] + ANYWHERE
         # One against a wall moves in vain: it stays within its node.
         half = NODE_STEPS / 2
         return pushed, np.clip(came, self.positions - half, self.positions + half)
