@@ -322,8 +322,9 @@ def test_blame_is_bounded_and_success_takes_it_back(agent, log):
             executor.act(still)
     ratio = blamed.graph.data / blamed.map_cost
     assert 1.0 < ratio.max() <= 100.0 + 1e-9
-    raised = (blamed.graph.data - blamed.map_cost).sum()
+    raised = blamed.graph.data.copy()
     there = agent.recognize(log.observations) == agent.num_nodes - 1
     for goal in range(blamed.num_nodes):
         drive(blamed, goal, log.ground_truth[there].mean(0))
-    assert (blamed.graph.data - blamed.map_cost).sum() < raised
+    assert (blamed.graph.data < raised).any()
+    assert (blamed.graph.data >= blamed.map_cost).all()
