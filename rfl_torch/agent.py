@@ -747,7 +747,9 @@ class Agent:
         """
         normal = self.normalize(observations)
         path = inference.most_likely_path(self._uniform_chain, normal)
-        return self.memory.remember(normal, path) if self.has_track and self.memory else path
+        if self.memory is not None and self.has_track:
+            path = self.memory.remember(normal, path)
+        return path
 
     def executor(self, goal: Goal, seed: int = 0) -> Executor:
         """Make the object that drives to `goal`.

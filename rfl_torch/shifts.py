@@ -47,9 +47,6 @@ EVIDENCE = 0.25
 FLOOR = 0.05
 """Of the noise, as a share of a full action's usual change."""
 
-ROUNDS = 2
-"""Regressions of the changes."""
-
 
 class Shifts(NamedTuple):
     """How far each step of some logs went.
@@ -88,6 +85,7 @@ def find_shifts(
     action = np.concatenate([2.0 * actions - 1.0 for actions in unit_actions]).astype(np.float64)
     look = np.concatenate([look[:-1] for look in looks])
     _, told = np.unique((middle / (FINE * unit)).round(), axis=0, return_index=True)
+    told_apart = middle[told]
     shift, measured = np.empty_like(action), np.empty_like(action)
     grip = np.ones((max(int(own.max()) for own in looks) + 1, action.shape[1]))
     for own, steps in enumerate(
@@ -95,16 +93,14 @@ def find_shifts(
     ):
         if not len(steps):
             continue
-        away = cdist(np.median(middle[steps], 0)[None], middle[told], "cityblock")[0]
+        away = cdist(np.median(middle[steps], 0)[None], told_apart, "cityblock")[0]
         near = told[away.argpartition(min(NEAREST, len(away)) - 1)[:NEAREST]]
         asked, seen = action[near], change[near]
         gain = _ridge(seen, asked, RIDGE * max(float((seen**2).sum()), 1e-12))
         measured[steps] = change[steps] @ gain
-        moved = np.where((seen @ gain) / _nonzero(asked) > 0.5, asked, 0.0)
-        for _ in range(ROUNDS):
-            shown = _ridge(moved, seen, MOVE_RIDGE * len(near))
-            noise = np.abs(seen - moved @ shown).mean(0) + FLOOR * unit
-            moved = _likeliest(seen, asked, shown, noise)
+        moved = np.where((seen @ gain) * asked > 0.5 * asked**2, asked, 0.0)
+        moved = _likeliest(seen, asked, *_what_shows(moved, seen, unit))
+        shown, noise = _what_shows(moved, seen, unit)
         shift[steps] = _likeliest(change[steps], action[steps], shown, noise)
         grip[own] = np.minimum(1.0, np.abs(shown).mean(1) / unit)
     measured /= np.maximum(1.0, np.abs(measured).max(1, keepdims=True))
@@ -119,8 +115,10 @@ def _ridge(inputs: Array, outputs: Array, penalty: float) -> Array:
     return np.asarray(np.linalg.solve(gram, inputs.T @ outputs))
 
 
-def _nonzero(values: Array) -> Array:
-    return np.where(values == 0.0, 1.0, values)
+def _what_shows(moved: Array, seen: Array, unit: float) -> tuple[Array, Array]:
+    """Change of the readings for a full action in each dimension, (A, D), and their noise, (D,)."""
+    shown = _ridge(moved, seen, MOVE_RIDGE * len(moved))
+    return shown, np.abs(seen - moved @ shown).mean(0) + FLOOR * unit
 
 
 def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array:

@@ -64,11 +64,14 @@ def test_both_files_hold_the_planned_graph(agents, log, tmp_path):
         assert edge["probability"] == pytest.approx(float(probability[source, target]))
     table = scoring.node_table(agent, [log], scoring.World("", 0, (1.0, 1.0), 2))
     path, means = agent.recognize(log.observations), agent.hmm.emission_mean.detach().numpy()
+    away = []
     for node, values in one.nodes(data=True):
         assert values["true_place"]
         np.testing.assert_allclose([values["x"], values["y"]], table.mean[node])
         reading = [values[f"reading_{k}"] for k in range(4)]
         np.testing.assert_allclose(reading, agent.raw_readings(means[node]), rtol=1e-6)
+        away.append(np.abs(log.observations[path == node].mean(0) - reading).max())
+    assert np.quantile(away, 0.9) < 0.1
     steps = list(zip(path[:-1].tolist(), path[1:].tolist(), strict=True))
     for source, target, edge in one.edges(data=True):
         assert edge["seen"] == steps.count((source, target))

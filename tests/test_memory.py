@@ -88,3 +88,11 @@ def test_a_memory_that_the_map_needs_stays_whole():
     for memory in (few, many._replace(node=node)):
         for own, other in zip(memory.thinned(), memory, strict=True):
             np.testing.assert_array_equal(own, other)
+
+
+def test_what_is_remembered_goes_on_from_what_was_seen_last():
+    seen = np.array([[0.1], [0.2], [0.1], [0.3]])
+    action = np.zeros((3, 1), np.float32)
+    memory = join([(np.array([0, 1, 2, 3]), seen, action)])
+    path = memory.remember(np.array([[0.2], [0.1], [0.9], [0.1]]), np.full(4, 7))
+    assert path.tolist() == [1, 2, 7, 0]

@@ -18,6 +18,7 @@ from rfl_torch.checkpoint import load_checkpoint
 from rfl_torch.free_ways import ways
 from rfl_torch.looks import find_looks, look_radius
 from rfl_torch.practice import AHEAD, untried
+from rfl_torch.shifts import find_shifts
 from sims.layouts import load_layout
 
 PLAN = {
@@ -106,6 +107,36 @@ def test_a_ring_is_one_ring_once_it_was_gone_round():
     angle = np.unwrap(np.arctan2(truth[:, 1] - 200, truth[:, 0] - 400))
     assert np.ptp(angle) > 2 * np.pi
     assert len(np.unique(node)) < 1.6 * len(np.unique(ring.look))
+
+
+def test_shifts_in_rooms_that_look_the_same_are_what_was_moved(walk):
+    (shift,) = find_shifts(*walk.parts(1), walk.radius).steps
+    moved = np.diff(walk.log.ground_truth, axis=0) / 10.0
+    was_stopped = (np.abs(moved - walk.log.actions) > 0.01).any(1)
+    assert was_stopped.mean() > 0.1
+    error = np.linalg.norm(shift - moved, axis=1)
+    asked = np.linalg.norm(walk.log.actions - moved, axis=1)
+    assert np.median(error[was_stopped]) < 0.01 * np.median(asked[was_stopped])
+    drift = (
+        np.linalg.norm((shift - moved).sum(0)),
+        np.linalg.norm((walk.log.actions - moved).sum(0)),
+    )
+    assert drift[0] < 20 < 200 < drift[1]
+
+
+def test_a_log_does_not_begin_where_what_it_saw_is_strange():
+    """It fits 100 steps of a known room but for 50, and 5 steps before an unknown one."""
+    known = places.KnownPlaces(6, 1)
+    known.follow(*stops((0, 0, 100), (1, 10, 100), (2, 20, 100), (5, 100, 5)), np.zeros(1))
+    look, shift = stops((5, 0, 5), (0, 20, 50), (1, 30, 50), (3, 40, 50))
+    assert known.find_start(look, shift) == pytest.approx(100.0, abs=1.0)
+
+
+def stops(*stays):
+    """Looks (T+1,) and shifts (T, 1) of a log that stays (look, position, steps) by turns."""
+    look = np.concatenate([np.full(steps, look) for look, _, steps in stays])
+    position = np.concatenate([np.full(steps, float(at)) for _, at, steps in stays])
+    return look, np.diff(position)[:, None]
 
 
 def test_logs_that_begin_anywhere_are_laid_on_one_another(walk):
