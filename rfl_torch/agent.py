@@ -38,6 +38,7 @@ from rfl_torch.executor import Executor, make_executor
 from rfl_torch.explorer import Explorer
 from rfl_torch.free_ways import FreeWays, learn_free_ways
 from rfl_torch.hmm import GridHMM, Statistics
+from rfl_torch.homing import move_to_sight, places_like
 from rfl_torch.looks import BATCH, find_looks, look_radius
 from rfl_torch.memory import Memory, join
 from rfl_torch.motion import Motion, remember, remember_more
@@ -60,10 +61,6 @@ UNFAMILIAR_SHARE = 0.001
 
 STRANGE_GOAL = 4.0
 """Radii of a look beyond which a goal is no place that the agent knows."""
-
-SAME_SIGHT = 0.1
-"""Radii of a look by which what was seen at other places may differ more from a goal than what is
-most like it. A corridor and its twin, 0.2 to 1 apart, are told apart so; identical bays are not."""
 
 HOP_PROBABILITY = 0.005
 """Chance a step that the belief changes over to a node that looks the same."""
@@ -764,43 +761,40 @@ class Agent:
             ValueError: if the goal is no kept node or no node fulfils it.
         """
         if isinstance(goal, int | np.integer) or callable(goal):
-            return make_executor(self, self._goal_nodes(goal), seed)
-        nodes = self._goal_nodes(goal)
+            return make_executor(self, [self._goal_nodes(goal)], seed)
         sight = self.normalize(np.asarray(goal))
-        executor = make_executor(self, nodes, seed, sight)
-        if self.strangeness(sight, int(nodes[0])) > STRANGE_GOAL:
+        places = self._places_like(sight)
+        executor = make_executor(self, places, seed, sight)
+        if self.strangeness(sight, int(places[0][0])) > STRANGE_GOAL:
             executor.status = "gave_up"
             executor.reason = "no node looks like the goal: the log has not been there"
         return executor
 
-    def _goal_nodes(self, goal: Goal) -> NDArray[np.int64]:
+    def _goal_nodes(self, goal: int | Callable[[int], bool]) -> NDArray[np.int64]:
         if isinstance(goal, int | np.integer):
             if not 0 <= goal < self.num_nodes:
                 raise ValueError(f"goal {goal} is no kept node; needs 0 to {self.num_nodes - 1}.")
             return np.array([goal])
-        if callable(goal):
-            nodes = np.array([node for node in range(self.num_nodes) if goal(node)], np.int64)
-            if not nodes.size:
-                raise ValueError("no kept node fulfils the goal's predicate; widen it.")
-            return nodes
-        normal = self.normalize(np.asarray(goal))
-        if normal.ndim != 1 or np.isnan(normal).all():
+        nodes = np.array([node for node in range(self.num_nodes) if goal(node)], np.int64)
+        if not nodes.size:
+            raise ValueError("no kept node fulfils the goal's predicate; widen it.")
+        return nodes
+
+    def _places_like(self, sight: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+        """Nodes at each place that looks like a goal (D,), the likeliest first."""
+        if sight.ndim != 1 or np.isnan(sight).all():
             raise ValueError(
-                f"goal has shape {normal.shape}; needs one observation "
+                f"goal has shape {sight.shape}; needs one observation "
                 f"({len(self.observation_low)},) with at least one reading."
             )
-        if self.memory is not None and self.has_track:
-            away = np.nanmean(np.abs(self.memory.observation - normal), 1) / self.look_radius
-            nearest = away.argmin()
-            if away[nearest] <= 1.0:
-                alike = self.memory.node[away <= away[nearest] + SAME_SIGHT]
-                first = self.memory.node[nearest]
-                return np.append(first, np.setdiff1d(alike, first))
-        likeliest = int(self.log_emission(normal).argmax())
-        if self.strangeness(normal, likeliest) > 1.0:  # densities of strange sights say little
-            likeliest = int(np.nanmean(np.abs(self._mean - normal), 1).argmin())
+        if self.memory is not None and self.positions is not None:
+            seen, node = self.memory.observation, self.memory.node
+            return places_like(seen, node, self.positions, sight, self.look_radius)
+        likeliest = int(self.log_emission(sight).argmax())
+        if self.strangeness(sight, likeliest) > 1.0:  # densities of strange sights say little
+            likeliest = int(np.nanmean(np.abs(self._mean - sight), 1).argmin())
         twins = self.twins.indices[self.twins.indptr[likeliest] : self.twins.indptr[likeliest + 1]]
-        return np.append(likeliest, twins).astype(np.int64)
+        return [np.append(likeliest, twins).astype(np.int64)]
 
     def explorer(self, seed: int = 0, node: int | None = None) -> Explorer:
         """What takes a robot to where it has seen nothing yet.
@@ -848,14 +842,22 @@ class Agent:
             inputs = torch.cat([mean[source], mean[target]], 1)
             return self.bank(inputs, torch.from_numpy(target).long()).numpy()
 
-    def control(
-        self, normal: NDArray[np.float64], node: int, target: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float32]:
-        """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,).
+    def control(self, normal: NDArray[np.float64], node: int) -> NDArray[np.float32]:
+        """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,)."""
+        return self._raw_action(self._unit_control(normal, node))
 
-        With a `target` (D,), it heads for that observation instead.
-        """
-        return self._raw_action(self._unit_control(normal, node, target))
+    def control_to_sight(
+        self, normal: NDArray[np.float64], node: int, sight: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """The action by which a robot at a node heads for where it sees a sight (D,), (A,)."""
+        if self.positions is None:
+            return self._raw_action(self._unit_control(normal, node, sight))
+        around = self._around(node)
+        node = int(around[np.nanmean(np.abs(self._mean[around] - normal), 1).argmin()])
+        around = self._around(node)
+        where, means = self.positions[around], self._mean[around]
+        move = move_to_sight(sight - normal, means - self._mean[node], where - self.positions[node])
+        return self._raw_action((move + 1.0) / 2.0)
 
     def control_by_reckoning(
         self, normal: NDArray[np.float64], node: int, here: int, where: NDArray[np.float64]
@@ -875,6 +877,9 @@ class Agent:
         )
         full = mend(action, asked, self.positions[node] - where)
         return self._raw_action((full + 1.0) / 2.0)
+
+    def _around(self, node: int) -> NDArray[np.int64]:
+        return np.asarray(self.near.indices[self.near.indptr[node] : self.near.indptr[node + 1]])
 
     def _unit_control(
         self, normal: NDArray[np.float64], node: int, target: NDArray[np.float64] | None = None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rfl_torch import inference
 from rfl_torch.explorer import Explorer
+from rfl_torch.homing import Homing
 from rfl_torch.innate import InnateController
 from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
@@ -58,10 +59,6 @@ LONGEST_SEARCH = 2000
 CONFIRMED = 10
 """Familiar steps in a row without a jump after which a belief that jumped may be trusted: a wall
 that moved makes one room look like another for some steps."""
-
-APPROACH = 20
-"""Steps from a goal's node to the goal's own sight, to within a full action of it; then a sight
-within a look's radius has to do."""
 
 KICK = 20
 """Innate actions after an aborted or a null plan, or the next plan fails where this one did. Three
@@ -160,12 +157,10 @@ class BeliefExecutor:
         agent: "Agent",
         goals: NDArray[np.int64],
         seed: int,
-        sight: NDArray[np.float64] | None = None,
+        homing: Homing | None = None,
     ) -> None:
         self._agent, self._config = agent, agent.config.executor
-        self._goals = goals
-        self._sight = sight
-        self._approach_left = 0 if sight is None else APPROACH
+        self._goals, self._homing = goals, homing
         self.goal = int(goals[0])
         self._seed = seed
         self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
@@ -180,7 +175,7 @@ class BeliefExecutor:
         self._where = np.empty((0, 0)) if agent.positions is None else agent.positions
         self._cost = agent.graph  # shared: what one task finds out, the next one knows
         # A goal that is a sight is any place that looks like it.
-        self._can_be_unsure = sight is None and len(agent.telling) < agent.num_nodes
+        self._can_be_unsure = homing is None and len(agent.telling) < agent.num_nodes
         self._knows_where = not self._can_be_unsure
         self._astray = self._jumps = 0
         self._confirmed = CONFIRMED
@@ -233,17 +228,12 @@ class BeliefExecutor:
         normal = self._recognize(self._sensed)
         is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._explorer is not None
         seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
-        if self.status == "running" and seems_there and self._trusts_sight():
-            if self._sight is None or self._sight_away(normal) <= 1 / LOOK_STEPS:
+        is_homing = self._homing is not None and self._homing.is_near(self.belief)
+        if self.status == "running" and (is_homing or (seems_there and self._trusts_sight())):
+            if self._homing is None:
                 self.status = "reached"
-            elif self._approach_left > 0:
-                self._approach_left -= 1
-                return self._agent.control(normal, self.node, self._sight)
-            elif self._sight_away(normal) <= 1.0:
-                self.status = "reached"
-            else:
-                self.status = "gave_up"
-                self.reason = "the place most like the goal does not look like it from near"
+            elif (action := self._go_home(self._homing, normal)) is not None:
+                return action
         if is_lost and self.status == "running":
             self.recovering = True
             self._next = -1
@@ -333,10 +323,16 @@ class BeliefExecutor:
         # What looks wrong there is off the map, if it isn't the senses that are wrong.
         self._astray = self._astray + 1 if is_telling and not self._knows_where else 0
 
-    def _sight_away(self, normal: NDArray[np.float64]) -> float:
-        """How far what the robot sees is from what it was told to look for, in radii of a look."""
-        assert self._sight is not None
-        return apart(normal, self._sight) / self._agent.look_radius
+    def _go_home(self, homing: Homing, normal: NDArray[np.float64]) -> NDArray[np.float32] | None:
+        """The action by which the robot heads for its goal's own sight, (A,), if it goes on."""
+        action = homing.act(normal, self.node)
+        if homing.is_there:
+            self.status = "reached"
+        elif not len(homing.nodes):
+            self.status = "gave_up"
+            self.reason = "no place that is like the goal looks just like it from near"
+        self._goals = homing.nodes
+        return action
 
     def _recognize(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter: push the belief over the edges, allow a teleport, weigh by the emission.
@@ -496,11 +492,22 @@ Executor = PathExecutor | BeliefExecutor | SteeringExecutor
 
 
 def make_executor(
-    agent: "Agent", goals: NDArray[np.int64], seed: int, sight: NDArray[np.float64] | None = None
+    agent: "Agent",
+    places: list[NDArray[np.int64]],
+    seed: int,
+    sight: NDArray[np.float64] | None = None,
 ) -> Executor:
-    """The executor that the agent's configuration asks for; `sight` is a goal's observation."""
+    """The executor that the agent's configuration asks for.
+
+    Args:
+        agent: to execute.
+        places: goal nodes at each place that will do, in the order to try them.
+        seed: of the innate actions.
+        sight: what is to be seen there, if the goal is that.
+    """
     if agent.config.executor.recognition == "path":
-        return PathExecutor(agent, goals, seed)
+        return PathExecutor(agent, places[0], seed)
     if agent.motion is not None:
-        return SteeringExecutor(agent, agent.motion, goals, seed)
-    return BeliefExecutor(agent, goals, seed, sight)
+        return SteeringExecutor(agent, agent.motion, places[0], seed)
+    homing = None if sight is None else Homing(agent, sight, places, seed)
+    return BeliefExecutor(agent, places[0], seed, homing)
