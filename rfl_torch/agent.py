@@ -35,7 +35,7 @@ from rfl_torch.controllers import (
     pool_sparse_nodes,
 )
 from rfl_torch.executor import Executor, make_executor
-from rfl_torch.explorer import Explorer
+from rfl_torch.explorer import FINE, WIDE, Explorer
 from rfl_torch.free_ways import FreeWays, learn_free_ways
 from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.homing import move_to_sight, places_like
@@ -808,7 +808,8 @@ class Agent:
         """
         if self.free_ways is None or self.positions is None:
             raise ValueError("the logs show no free ways: their actions don't add up to positions.")
-        explorer = Explorer(*self.action_bounds, self.look_radius, self.free_ways, seed)
+        gap = WIDE if node is None else FINE
+        explorer = Explorer(*self.action_bounds, self.look_radius, self.free_ways, seed, gap)
         if node is not None:
             explorer.know(self.positions - self.positions[node])
         return explorer

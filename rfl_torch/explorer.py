@@ -34,9 +34,9 @@ UNSEEN = 0.3
 BUMP = 3.0
 """And a wall that was run into."""
 
-GAP = 3
-"""Cells from all that were entered for a cell to be new. At 1 rooms are combed whose every corner
-can be seen."""
+WIDE, FINE = 3, 1
+"""Cells from all that were entered for a cell to be new: to a robot that is lost, and to one that
+completes its map. To comb rooms whose every corner can be seen finds no map."""
 
 PLAN_STEPS, CELL_STEPS = 12, 12
 """Steps between two plans, and until the next cell counts as out of reach."""
@@ -84,6 +84,7 @@ class Explorer:
         radius: of a look, see `looks.look_radius`.
         free_ways: what the logs say of free ways.
         seed: decides where no cell is left.
+        gap: cells from all that were entered for a cell to be new, WIDE or FINE.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Explorer:
         radius: float,
         free_ways: FreeWays,
         seed: int,
+        gap: int = WIDE,
     ) -> None:
         self._low, self._high, self._free_ways = low, high, free_ways
         self._rng = np.random.default_rng(seed)
@@ -102,13 +104,18 @@ class Explorer:
         self._least = NOISE_MARGIN * free_ways.still + LEAST_CHANGE * unit * self._lag
         self.position = np.zeros(len(low))
         """By dead reckoning from the first step, in full actions, (A,)."""
-        self._cells = Cells(len(low))
+        self._cells = Cells(len(low), gap)
         self._path: list[NDArray[np.int64]] = []
         self._plan_left = self._cell_left = 0
         self._did: Array | None = None
         self._jammed = -1
         self._seen = np.empty(0)
         self._run: _Run | None = None
+
+    @property
+    def cells_to_new(self) -> int:
+        """Cells on the way to the nearest one of which nothing is known; 0 if there is none."""
+        return len(self._path)
 
     def know(self, positions: Array) -> None:
         """Take places (N, A), counted in full actions from here, for known: none is new."""
@@ -209,9 +216,11 @@ class Cells:
 
     Args:
         dim: A.
+        gap: cells from all that were entered for a cell to be new.
     """
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, gap: int) -> None:
+        self._gap = gap
         self._begin(np.zeros(dim, np.int64))
 
     def _begin(self, here: NDArray[np.int64]) -> None:
@@ -233,7 +242,7 @@ class Cells:
         if self._entered[at]:
             return False
         self._entered[at] = True
-        self._old[tuple(slice(k - GAP, k + GAP + 1) for k in at)] = True
+        self._old[tuple(slice(k - self._gap, k + self._gap + 1) for k in at)] = True
         return True
 
     def see(self, free: NDArray[np.int64], blocked: NDArray[np.int64]) -> None:
@@ -301,8 +310,8 @@ class Cells:
     def _hold(self, cell: NDArray[np.int64]) -> None:
         """Grow until a cell (A,) has a margin around it."""
         at, shape = cell - self._corner, np.array(self._free.shape)
-        before = np.where(at < GAP, MARGIN - at, 0).clip(0)
-        after = np.where(at >= shape - GAP, at + MARGIN + 1 - shape, 0).clip(0)
+        before = np.where(at < self._gap, MARGIN - at, 0).clip(0)
+        after = np.where(at >= shape - self._gap, at + MARGIN + 1 - shape, 0).clip(0)
         if not (before.any() or after.any()):
             return
         sides = list(zip(before.tolist(), after.tolist(), strict=True))

@@ -6,7 +6,7 @@ there. All that it saw and did goes into the map, the controllers and the costs 
 
     random          any node
     least_visited   the node that was seen least
-    frontier        the node with most actions that lead to no known node, for the way there
+    frontier        the node from which most of what is unknown is in sight, for the way there
     progress        the node whose success rate, or lack of one, changes most
 """
 
@@ -15,13 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rfl_torch.executor import CONFIRMED
 from rfl_torch.explorer import Explorer
-from rfl_torch.free_ways import ways
-from rfl_torch.innate import directions, done_row, env_action, nearest_direction
-from rfl_torch.places import NODE_STEPS
+from rfl_torch.frontier import promise, untried
+from rfl_torch.innate import directions, done_row, env_action
 from rfl_torch.planner import cost_to_go
 from rfl_torch.search import HOLD, LookSearch
 from rfl_torch.trajectory import Trajectory
@@ -44,8 +42,9 @@ LONGEST_WAY = 400
 LOOK_AROUND = 30
 """Steps spent at a goal on what was tried least."""
 
-AHEAD = 8.0
-"""Full actions ahead of a node, along a way that looks free, where no node is: a frontier."""
+STAY = 8
+"""Cells on the way to the nearest one of which nothing is known, up to which a walk in unknown land
+goes on although it has come back to the map."""
 
 OFF_MAP = 200
 """Steps that a walk in unknown land may take on top before it is learned from."""
@@ -95,6 +94,7 @@ class Goals:
         self.slow = np.append(self.slow[kept], np.full(more, 0.0))  # new nodes promise progress
         self.failures = np.append(self.failures[kept], np.zeros(more))
         self.untried = untried(self._agent)
+        self.promise = promise(self._agent, self.untried)
 
     def choose(self, node: int) -> int:
         """The next goal, from where the robot is."""
@@ -109,8 +109,8 @@ class Goals:
         if not is_open.any():
             return _smallest(agent.visits, rng)
         away = cost_to_go(agent.graph.T.tocsr(), np.array([node]))
-        promise = np.maximum(1, self.untried.sum(1)) / 2.0**self.failures
-        away = np.where(is_open, (away + LOOK_AROUND) / promise, np.inf)
+        worth = np.maximum(1, self.promise) / 2.0**self.failures
+        away = np.where(is_open, (away + LOOK_AROUND) / worth, np.inf)
         return _smallest(away, rng) if np.isfinite(away).any() else _smallest(agent.visits, rng)
 
     def note(self, goal: int, reached: bool) -> None:
@@ -126,27 +126,6 @@ class Goals:
         choice = int(self._rng.choice(np.flatnonzero(self.untried[node])))
         self.untried[node, choice] = False
         return choice
-
-
-def untried(agent: "Agent") -> NDArray[np.bool_]:
-    """Actions at each node that lead to no node that is known, (N, K).
-
-    Where actions add up to positions, those that look free, lead to where no node is, and were not
-    done there for long. Else, or if there are none, those never done that lead to no neighbour.
-    """
-    if agent.positions is not None and agent.free_ways is not None:
-        ahead = agent.positions[:, None] + AHEAD * ways(agent.positions.shape[1])
-        away, _ = cKDTree(agent.positions).query(ahead)
-        means = agent.hmm.emission_mean.detach().numpy()
-        free = np.stack([agent.free_ways.at(mean) for mean in means])
-        is_open = (away > NODE_STEPS) & (free > AHEAD) & (agent.tried < HOLD)
-        if is_open.any():
-            return np.asarray(is_open)
-    graph = agent.graph.tocoo()
-    way, _ = nearest_direction(agent.ask(graph.row, graph.col))
-    known = agent.tried > 0
-    known[graph.row, way] = True
-    return ~known
 
 
 def _smallest(values: NDArray[np.float64], rng: np.random.Generator) -> int:
@@ -271,9 +250,7 @@ def _look_around(
                 node = executor.node
             elif agent.free_ways is not None:
                 explorer = agent.explorer(int(rng.integers(2**31)), node)
-                num_steps, num_known = _explore(agent, run, executor, explorer, min(most, run.left))
-                most -= num_steps
-                left -= num_known
+                most -= _explore(agent, run, executor, explorer, min(most, run.left))
                 break
             if choice is None or not executor.is_familiar:
                 action = search.act(agent.normalize(run.observation))
@@ -285,20 +262,17 @@ def _look_around(
             left -= executor.is_familiar
 
 
-def _explore(
-    agent: "Agent", run: _Run, executor: Any, explorer: Explorer, most: int
-) -> tuple[int, int]:
-    """Walk in unknown land until the map is come to again; steps taken, and those on the map."""
-    num_known = known = 0
+def _explore(agent: "Agent", run: _Run, executor: Any, explorer: Explorer, most: int) -> int:
+    """Walk in unknown land until all that is near is known; returns the steps taken."""
+    known = 0
     for step in range(most):
         action = explorer.act(agent.normalize(run.observation))
         run.step(action)
         executor.watch(run.observation, action)
-        num_known += executor.is_familiar
         known = known + 1 if executor.is_familiar else 0
-        if known == CONFIRMED:
-            return step + 1, num_known
-    return most, num_known
+        if known >= CONFIRMED and not 0 < explorer.cells_to_new <= STAY:
+            return step + 1
+    return most
 
 
 def _report(

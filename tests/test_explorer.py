@@ -6,7 +6,7 @@ import pytest
 
 import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, record
-from rfl_torch.explorer import Explorer
+from rfl_torch.explorer import FINE, WIDE, Cells, Explorer
 from rfl_torch.free_ways import LONGEST, FreeWays, ways
 
 
@@ -50,9 +50,10 @@ class Hook:
                     break
 
 
-def explorer(still=0.0):
+def explorer(still=0.0, gap=WIDE):
     sees_all = FreeWays(np.concatenate([LONGEST * np.eye(8), np.zeros((1, 8))]), still)
-    return Explorer(*BOUNDS, 2 * 0.6 / LONGEST, sees_all, 0)  # an action changes six ways of eight
+    radius = 2 * 0.6 / LONGEST  # an action changes six ways of eight
+    return Explorer(*BOUNDS, radius, sees_all, 0, gap)
 
 
 @pytest.mark.parametrize(("noise", "still"), [(0.0, 0.0), (0.05, 0.01)])
@@ -104,6 +105,26 @@ def test_an_explorer_leaves_what_is_known(side):
     for _ in range(20):
         room.do(search.act(room.see()))
     assert side * (room.position[0] - 30) > 5
+
+
+@pytest.mark.parametrize("gap", [FINE, WIDE])
+def test_a_cell_is_new_beyond_a_gap_around_those_that_were_entered(gap):
+    cells, row = Cells(2, gap), np.array([[x, 0] for x in range(-8, 9)])
+    for cell in row:
+        cells.enter(cell)
+    way = cells.way_to_new(np.array([0, 0]))
+    assert len(way) == abs(way[-1][1]) == gap + 1
+
+
+def test_an_explorer_says_how_far_it_is_to_what_is_new():
+    room, search = Hook((30, 10)), explorer()
+    search.act(room.see())
+    assert 0 < search.cells_to_new < 8
+    x, y = np.meshgrid(np.arange(-40, 41, 2), np.arange(-20, 61, 2), indexing="ij")
+    far = explorer()
+    far.know(np.stack([x.ravel(), y.ravel()], 1))
+    far.act(room.see())
+    assert far.cells_to_new >= 8
 
 
 @pytest.mark.parametrize(

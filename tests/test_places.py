@@ -16,8 +16,8 @@ from rfl_torch import Agent, AgentConfig, Stage, Trajectory, places, record, rep
 from rfl_torch import memory as memory_module
 from rfl_torch.checkpoint import load_checkpoint
 from rfl_torch.free_ways import ways
+from rfl_torch.frontier import AHEAD, untried
 from rfl_torch.looks import find_looks, look_radius
-from rfl_torch.practice import AHEAD, untried
 from rfl_torch.shifts import find_shifts
 from sims.layouts import load_layout
 

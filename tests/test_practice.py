@@ -7,8 +7,9 @@ from test_growth import covered, half_log
 from worlds import DotWorld, dot_config, dot_log
 
 from rfl_torch import Agent, record
+from rfl_torch.frontier import untried
 from rfl_torch.innate import nearest_direction
-from rfl_torch.practice import Goals, Strategy, untried
+from rfl_torch.practice import Goals, Strategy
 
 
 class Recorder(DotWorld):
