@@ -38,7 +38,7 @@ from rfl_torch.executor import Executor, make_executor
 from rfl_torch.explorer import FINE, WIDE, Explorer
 from rfl_torch.free_ways import FreeWays, learn_free_ways
 from rfl_torch.hmm import GridHMM, Statistics
-from rfl_torch.homing import move_to_sight, places_like
+from rfl_torch.homing import Homing, Place, move_to_sight, places_like
 from rfl_torch.looks import BATCH, find_looks, look_radius
 from rfl_torch.memory import Memory, join
 from rfl_torch.motion import Motion, remember, remember_more
@@ -761,11 +761,11 @@ class Agent:
             ValueError: if the goal is no kept node or no node fulfils it.
         """
         if isinstance(goal, int | np.integer) or callable(goal):
-            return make_executor(self, [self._goal_nodes(goal)], seed)
+            return make_executor(self, self._goal_nodes(goal), seed)
         sight = self.normalize(np.asarray(goal))
-        places = self._places_like(sight)
-        executor = make_executor(self, places, seed, sight)
-        if self.strangeness(sight, int(places[0][0])) > STRANGE_GOAL:
+        homing = Homing(self, sight, self._places_like(sight), seed)
+        executor = make_executor(self, homing.nodes, seed, homing)
+        if self.strangeness(sight, int(homing.nodes[0])) > STRANGE_GOAL:
             executor.status = "gave_up"
             executor.reason = "no node looks like the goal: the log has not been there"
         return executor
@@ -780,8 +780,8 @@ class Agent:
             raise ValueError("no kept node fulfils the goal's predicate; widen it.")
         return nodes
 
-    def _places_like(self, sight: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-        """Nodes at each place that looks like a goal (D,), the likeliest first."""
+    def _places_like(self, sight: NDArray[np.float64]) -> list[Place]:
+        """Places that look like a goal (D,), the likeliest first."""
         if sight.ndim != 1 or np.isnan(sight).all():
             raise ValueError(
                 f"goal has shape {sight.shape}; needs one observation "
@@ -794,7 +794,8 @@ class Agent:
         if self.strangeness(sight, likeliest) > 1.0:  # densities of strange sights say little
             likeliest = int(np.nanmean(np.abs(self._mean - sight), 1).argmin())
         twins = self.twins.indices[self.twins.indptr[likeliest] : self.twins.indptr[likeliest + 1]]
-        return [np.append(likeliest, twins).astype(np.int64)]
+        nodes = np.append(likeliest, twins).astype(np.int64)
+        return [Place(nodes, self.strangeness(sight, likeliest))]
 
     def explorer(self, seed: int = 0, node: int | None = None) -> Explorer:
         """What takes a robot to where it has seen nothing yet.

@@ -492,22 +492,18 @@ Executor = PathExecutor | BeliefExecutor | SteeringExecutor
 
 
 def make_executor(
-    agent: "Agent",
-    places: list[NDArray[np.int64]],
-    seed: int,
-    sight: NDArray[np.float64] | None = None,
+    agent: "Agent", goals: NDArray[np.int64], seed: int, homing: Homing | None = None
 ) -> Executor:
     """The executor that the agent's configuration asks for.
 
     Args:
         agent: to execute.
-        places: goal nodes at each place that will do, in the order to try them.
+        goals: nodes, any of which will do.
         seed: of the innate actions.
-        sight: what is to be seen there, if the goal is that.
+        homing: what goes on from there, if the goal is a sight.
     """
     if agent.config.executor.recognition == "path":
-        return PathExecutor(agent, places[0], seed)
+        return PathExecutor(agent, goals, seed)
     if agent.motion is not None:
-        return SteeringExecutor(agent, agent.motion, places[0], seed)
-    homing = None if sight is None else Homing(agent, sight, places, seed)
-    return BeliefExecutor(agent, places[0], seed, homing)
+        return SteeringExecutor(agent, agent.motion, goals, seed)
+    return BeliefExecutor(agent, goals, seed, homing)

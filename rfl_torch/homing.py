@@ -7,7 +7,7 @@ node on to the sight itself, and tries another place where that can't be seen.
     o_i + (y - p_i) G_i    what is seen at y around node i: G_i regressed on the nodes around it
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +34,18 @@ PLACES = 3
 APPROACH = 30
 """Steps at a place until it is left for the next."""
 
+HOPE = 2.0
+"""Times as far as it came that what the logs saw elsewhere may be from the goal, to be tried."""
+
 STUCK, KICK, CLOSER = 6, 3, 0.02
 """Steps in a row that lead no closer, by so many radii of a look, and random ones done then."""
 
 JUST_LIKE = 0.5 / LOOK_STEPS
-"""Radii of a look from the goal: half a full action."""
+"""Radii of a look from the goal within which the robot is there: half a full action."""
+
+LIKE = 0.35
+"""And where it comes no closer. What other places show may be less like the goal, and to see that
+takes a walk there and back."""
 
 AROUND = 6.0
 """Full actions from a node to those that tell most of what is seen around it."""
@@ -47,17 +54,28 @@ RIDGE = 1e-4
 """Of a move, against changes of the readings by a share of their range each."""
 
 
+class Place(NamedTuple):
+    """Where the logs saw something like a goal.
+
+    nodes: there and wherever it is as like, that most like it first.
+    away: radii of a look from the goal.
+    """
+
+    nodes: Labels
+    away: float
+
+
 class Homing:
     """Goes to what looks just like a goal, place by place.
 
     Args:
         agent: whose map it is.
         sight: normalised readings of the goal, (D,).
-        places: nodes at each place, that most like it first.
+        places: that most like it first.
         seed: of the random steps.
     """
 
-    def __init__(self, agent: "Agent", sight: Array, places: list[Labels], seed: int) -> None:
+    def __init__(self, agent: "Agent", sight: Array, places: list[Place], seed: int) -> None:
         self._agent, self._sight, self._places = agent, sight, places
         low, high = agent.action_bounds
         self._search = LookSearch(low, high, agent.look_radius, seed)
@@ -66,10 +84,10 @@ class Homing:
         self._closest: list[float] = []
         self._is_last = False
         self.is_there = False
-        self._go_to(places[0])
+        self._go_to(0)
 
-    def _go_to(self, nodes: Labels) -> None:
-        self.nodes: Labels = nodes
+    def _go_to(self, place: int) -> None:
+        self.nodes: Labels = self._places[place].nodes
         self._left, self._least, self._since, self._kick = APPROACH, np.inf, 0, 0
 
     def is_near(self, belief: Array) -> bool:
@@ -88,18 +106,21 @@ class Homing:
             node: where the robot is.
         """
         away = apart(normal, self._sight) / self._agent.look_radius
-        self.is_there = away <= self._enough
-        if self.is_there:
-            return None
         if away < self._least - CLOSER:
             self._least, self._since = away, 0
         else:
             self._since += 1
+        is_stuck = self._since >= STUCK
+        is_done = is_stuck or self._left == 0
+        self.is_there = away <= (max(LIKE, self._enough) if is_done else self._enough)
+        self.is_there |= is_done and self._is_last
+        if self.is_there:
+            return None
         if self._left == 0:
             self._leave()
             return None
         self._left -= 1
-        if self._since >= STUCK:
+        if is_stuck:
             self._since, self._kick = 0, KICK
         if self._kick > 0:
             self._kick -= 1
@@ -107,24 +128,27 @@ class Homing:
         return self._agent.control_to_sight(normal, node, self._sight)
 
     def _leave(self) -> None:
-        """Take the next place; at the end the one that looked most like the goal, if any did."""
+        """Take the next place that may be more like the goal than those that were tried.
+
+        If there is none, that which was most like it, if it was at all.
+        """
         self._closest.append(self._least)
-        num = len(self._closest)
-        best = int(np.argmin(self._closest))
-        if num < len(self._places):
-            self._go_to(self._places[num])
-        elif not self._is_last and self._closest[best] <= 1.0:
+        num, best = len(self._closest), int(np.argmin(self._closest))
+        least = self._closest[best]
+        if num < len(self._places) and self._places[num].away <= HOPE * least:
+            self._go_to(num)
+        elif least <= 1.0:
             self._is_last = True
-            self._enough = 1.0
-            self._go_to(self._places[best])
+            self._enough = max(self._enough, least)
+            self._go_to(best)
         else:
             self.nodes = np.empty(0, np.int64)
 
 
 def places_like(
     seen: NDArray[np.floating], node: Labels, positions: Array, sight: Array, radius: float
-) -> list[Labels]:
-    """Nodes at each place where the logs saw what is most like a sight, the likeliest first.
+) -> list[Place]:
+    """The places where the logs saw what is most like a sight, the likeliest first.
 
     Args:
         seen: what the logs saw, (M, D).
@@ -134,12 +158,13 @@ def places_like(
         radius: of a look.
     """
     away = np.nanmean(np.abs(seen - sight), 1) / radius
-    places: list[Labels] = []
+    places: list[Place] = []
     while len(places) < PLACES and np.isfinite(away.min()):
         first = node[away.argmin()]
         alike = np.setdiff1d(node[away <= away.min() + SAME_SIGHT], first)
-        places.append(np.append(first, alike))
-        apart_from = np.linalg.norm(positions[:, None] - positions[places[-1]], axis=2).min(1)
+        nodes = np.append(first, alike)
+        places.append(Place(nodes, float(away.min())))
+        apart_from = np.linalg.norm(positions[:, None] - positions[nodes], axis=2).min(1)
         away[apart_from[node] < PLACE_STEPS] = np.inf
     return places
 

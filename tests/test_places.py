@@ -440,7 +440,7 @@ def test_a_goal_is_where_the_log_saw_what_is_most_like_it(late, half_path):
     (walk, _), agent = late, Agent.load(half_path)
     seen = agent.memory.observation
     for step in range(0, len(seen), 97):
-        goals = agent._places_like(agent.normalize(walk.log.observations[step]))[0]
+        goals = agent._places_like(agent.normalize(walk.log.observations[step]))[0].nodes
         assert goals[0] == agent.memory.node[step]
         away = np.abs(seen - seen[step]).mean(1) / agent.look_radius
         assert set(goals) == set(agent.memory.node[away <= 0.1])
