@@ -58,6 +58,9 @@ PLAIN, LEAST_HOLD = 0.2, 0.03
 place holds the track by where none shows. Halfway along a hall a look goes on for so long that the
 track shrank to a half of it; with no hold at all, a track that drifted stays so."""
 
+HARDLY = 0.15
+"""Hold below which moves hardly show."""
+
 LOOSE = 1e-6
 """Weight of the track as followed, which holds what nothing else does."""
 
@@ -112,9 +115,23 @@ class Track(NamedTuple):
     """How much each look holds the track along each dimension, (L, A), 1 where moves show."""
 
     def positions(self) -> list[Array]:
-        """Of every observation on the relaxed track, in full actions, (T+1, A) each."""
+        """Of every observation on the relaxed track, in full actions, (T+1, A) each.
+
+        A place is as large as a track drifts, and the track is drawn to its middle. Where moves
+        hardly show there is next to nothing to hold against that, and a hall would come out too
+        short: there it is relaxed anew with nodes for places.
+        """
         holds = [self.hold[look] for look in self.looks]
-        return relax(self.nodes, self.shifts, self.followed, holds)
+        tracks = relax(self.nodes, self.shifts, self.followed, holds)
+        hardly_shows = [hold.min(1) < HARDLY for hold in holds]
+        if not np.concatenate(hardly_shows).any():
+            return tracks
+        own = [node + self.num_places for node in self.split(tracks)]
+        parts = zip(hardly_shows, own, self.nodes, strict=True)
+        _, flat = np.unique(
+            np.concatenate([np.where(*part) for part in parts]), return_inverse=True
+        )
+        return relax(np.split(flat, _starts(own)[1:]), self.shifts, tracks, holds)
 
     def split(self, positions: list[Array]) -> list[Labels]:
         """Nodes, one for each look at each of the `positions`' places, int64 (T+1,) each."""
