@@ -855,7 +855,7 @@ class Agent:
         if self.positions is None:
             return self._raw_action(self._unit_control(normal, node, sight))
         around = self._around(node)
-        node = int(around[np.nanmean(np.abs(self._mean[around] - normal), 1).argmin()])
+        node = int(around[np.nansum(np.abs(self._mean[around] - normal), 1).argmin()])
         around = self._around(node)
         where, means = self.positions[around], self._mean[around]
         move = move_to_sight(sight - normal, means - self._mean[node], where - self.positions[node])

@@ -139,6 +139,10 @@ def test_a_robot_goes_on_from_the_node_to_where_it_sees_just_what_it_was_shown()
                     break
                 observation, _, _, _, info = env.step(action)
             assert executor.status == "reached"
+            blind = agent.control_to_sight(
+                np.full(24, np.nan), executor.node, agent.normalize(sight)
+            )
+            assert np.isfinite(blind).all()
             off.append(np.linalg.norm(info["ground_truth"] - place))
     print(np.round(off, 1))
     assert np.median(off) < 8
