@@ -46,7 +46,7 @@ class FreeWays(NamedTuple):
     still: float
 
     def at(self, normal: Array) -> Array:
-        """Full actions along each of the `ways` that are free, (W,), where (D,) is seen."""
+        """Full actions along each of the `ways` that are free, (..., W), where (..., D) is seen."""
         return np.clip(normal @ self.weight[:-1] + self.weight[-1], 0.0, LONGEST)
 
 

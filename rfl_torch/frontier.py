@@ -79,5 +79,4 @@ def promise(agent: "Agent", is_open: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _free(agent: "Agent") -> NDArray[np.float64]:
     """Full actions that look free along each of the ways at each node, (N, W)."""
     assert agent.free_ways is not None
-    means = agent.hmm.emission_mean.detach().numpy()
-    return np.stack([agent.free_ways.at(mean) for mean in means])
+    return agent.free_ways.at(agent.hmm.emission_mean.detach().numpy())

@@ -88,13 +88,14 @@ class Homing:
 
     def _go_to(self, place: int) -> None:
         self.nodes: Labels = self._places[place].nodes
+        self._is_near = self._agent.near[self.nodes].sum(0) > 0
         self._left, self._least, self._since, self._kick = APPROACH, np.inf, 0, 0
 
     def is_near(self, belief: Array) -> bool:
         """Whether a robot that has come to the place is still there, by its belief (N,)."""
         if np.isinf(self._least):
             return False
-        return bool(belief[self._agent.near[self.nodes].sum(0) > 0].sum() > 0.5)
+        return bool(belief[self._is_near].sum() > 0.5)
 
     def act(self, normal: Array, node: int) -> NDArray[np.float32] | None:
         """Return the action of this step, (A,); None if it `is_there`, or `nodes` are others now.

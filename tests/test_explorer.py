@@ -116,6 +116,17 @@ def test_a_cell_is_new_beyond_a_gap_around_those_that_were_entered(gap):
     assert len(way) == abs(way[-1][1]) == gap + 1
 
 
+def test_who_completes_a_map_finds_something_new_nearer_than_who_is_lost():
+    log, agent = learned()
+    seen = agent.normalize(log.observations[3000])
+    node = int(agent.memory.node[3000])
+    lost, fine = agent.explorer(), agent.explorer(node=node)
+    lost.know(agent.positions - agent.positions[node])  # all that differs is the gap
+    for search in (lost, fine):
+        search.act(seen)
+    assert 0 < fine.cells_to_new < lost.cells_to_new
+
+
 def test_an_explorer_says_how_far_it_is_to_what_is_new():
     room, search = Hook((30, 10)), explorer()
     search.act(room.see())

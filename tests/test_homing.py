@@ -11,6 +11,7 @@ import sims  # noqa: F401
 from rfl_torch import Agent, AgentConfig, record
 from rfl_torch.homing import (
     APPROACH,
+    KICK,
     PLACES,
     SAME_SIGHT,
     STUCK,
@@ -20,6 +21,14 @@ from rfl_torch.homing import (
     places_like,
 )
 from rfl_torch.places import PLACE_STEPS
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """A log of 6,000 steps in the paper's maze, and what was learned from it."""
+    with gym.make("rfl/RangefinderMaze-v0", layout="paper") as env:
+        log = record(env, 6000, hold=3, seed=0)
+    return log, Agent(AgentConfig(), 0).fit(log)
 
 
 @pytest.mark.parametrize("is_missing", [False, True])
@@ -119,11 +128,29 @@ def test_a_goal_that_nothing_looks_like_is_given_up():
     assert not len(goes.nodes)
 
 
-def test_a_robot_goes_on_from_the_node_to_where_it_sees_just_what_it_was_shown():
+def test_a_robot_that_comes_no_closer_tries_other_steps_for_a_while():
+    goes = homing(0.4)
+    actions = [goes.act(np.full(6, 0.5), 0) for _ in range(STUCK + KICK + 1)]
+    is_still = [not action.any() for action in actions]
+    assert is_still == [True] * STUCK + [False] * KICK + [True]
+
+
+def test_a_robot_that_is_nearly_there_goes_on_though_what_it_sees_is_strange(learned):
+    """Between two sights of the log there is one that no node explains."""
+    log, agent = learned
+    executor, seen = agent.executor(log.observations[3000]), []
+    executor.act(log.observations[2990])
+    executor._homing.is_near = lambda belief: True
+    executor._homing.act = lambda normal, node: seen.append(normal) or np.zeros(2, np.float32)
+    executor.act(1.0 - log.observations[3000])
+    assert not executor.is_familiar
+    assert len(seen) == 1
+
+
+def test_a_robot_goes_on_from_the_node_to_where_it_sees_just_what_it_was_shown(learned):
     """Goals up to 25 mm off the track of the log; nodes are 44 mm apart."""
+    log, agent = learned
     with gym.make("rfl/RangefinderMaze-v0", layout="paper", max_episode_steps=-1) as env:
-        log = record(env, 6000, hold=3, seed=0)
-        agent = Agent(AgentConfig(), 0).fit(log)
         room, rng, off = env.unwrapped.layout, np.random.default_rng(1), []
         while len(off) < 20:
             place = log.ground_truth[rng.integers(6000)] + rng.uniform(-25, 25, 2)

@@ -1,3 +1,4 @@
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
@@ -7,9 +8,10 @@ from test_growth import covered, half_log
 from worlds import DotWorld, dot_config, dot_log
 
 from rfl_torch import Agent, record
+from rfl_torch.executor import CONFIRMED
 from rfl_torch.frontier import untried
 from rfl_torch.innate import nearest_direction
-from rfl_torch.practice import Goals, Strategy
+from rfl_torch.practice import STAY, Goals, Strategy, _explore
 
 
 class Recorder(DotWorld):
@@ -135,9 +137,32 @@ def test_each_strategy_takes_the_node_it_promises(half_path):
     frontier.untried[:] = False
     frontier.untried[5, 0] = True
     assert frontier.choose(0) == 5
+    frontier.untried[6, 0] = True
+    for best in (5, 6):
+        frontier.promise[:] = 1.0
+        frontier.promise[best] = 1000.0  # worth any way
+        assert frontier.choose(0) == best
+    frontier.untried[6, 0] = False
     assert frontier.try_out(5) == 0
     assert frontier.try_out(5) is None
     assert len({Goals(agent, "random", rng).choose(0) for _ in range(50)}) > 5
+
+
+@pytest.mark.parametrize(("away", "goes_on"), [(STAY, True), (STAY + 1, False), (0, False)])
+def test_a_walk_in_unknown_land_goes_on_while_something_new_is_near(away, goes_on):
+    """The map looks familiar from the first step on; after 40 steps nothing is new any more."""
+    explorer = SimpleNamespace(cells_to_new=away, num_steps=0)
+
+    def act(_):
+        explorer.num_steps += 1
+        explorer.cells_to_new = away if explorer.num_steps <= 40 else 0
+
+    explorer.act = act
+    agent = SimpleNamespace(normalize=lambda observation: observation)
+    run = SimpleNamespace(observation=None, step=lambda action: None)
+    executor = SimpleNamespace(is_familiar=True, watch=lambda *_: None)
+    num_steps = _explore(agent, run, executor, explorer, 100)
+    assert num_steps == explorer.num_steps == (41 if goes_on else CONFIRMED)
 
 
 def test_a_grid_map_can_be_practised_with_too():
