@@ -56,7 +56,7 @@ Bank = MLPBank | RBFBank | SVRBank
 REVERSIBLE_SHARE = 0.5
 """A world is reversible if controllers explain this share of a backwards log's actions."""
 
-UNFAMILIAR_SHARE = 0.001
+UNFAMILIAR_SHARE = 0.05
 """An observation is unfamiliar if its density is below that of all but this share of the log."""
 
 STRANGE_GOAL = 4.0

@@ -49,6 +49,11 @@ LONGEST_DOUBT = 60
 """Steps in a row that the map is followed while many readings don't fit: about a moved wall's
 reach. A robot whose senses are wrong everywhere is lost after that."""
 
+LONGEST_ASTRAY = 300
+"""Steps in a row where it could tell where it is, none of which looks right, after which the senses
+are taken for wrong and not the place. A robot in a room that no log knows, and that looks like one
+that is known, must come back within them."""
+
 SOME = 0.2
 """Share of the sights of the last LONGEST_DOUBT steps that must be familiar where arrival is said.
 To a robot whose senses are wrong everywhere, one in a hundred looks familiar, by chance."""
@@ -315,7 +320,7 @@ class BeliefExecutor:
         if not self._can_be_unsure:
             return
         is_telling = self.node in self._agent.telling
-        if is_telling and (is_plain or self._astray > LONGEST_DOUBT):
+        if is_telling and (is_plain or self._astray > LONGEST_ASTRAY):
             self._knows_where = True
         elif before >= 0 and not self._agent.near[before, self.node] and self._knows_where:
             self._jumps += 1
@@ -359,8 +364,12 @@ class BeliefExecutor:
         self.node = int(self.belief.argmax())
         self._known = self._known + 1 if self.is_familiar else 0
         if self._known >= CONFIRMED:
-            self._explorer, self._was_known = None, True  # back on the map
-        if self.is_familiar:
+            self._was_known = True
+            if self._knows_where:
+                self._explorer = None  # back on the map; a room that looks the same may not be
+        # What is wrong where it asks which place this is may be the place, not the sensor.
+        is_asking = not self._knows_where and self.node in self._agent.telling
+        if self.is_familiar and not is_asking:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
         self._ask_whether(before)
         self._ask_where(before, bool(seen[self.node] >= self._agent.least_familiar))

@@ -501,3 +501,30 @@ def test_a_robot_put_into_one_of_two_rooms_goes_to_see_which_it_is(plan, walk):
             away = np.linalg.norm(info["ground_truth"] - place[goal])
             reached += executor.status == "reached" and bool(away < 44)
     assert reached == 4
+
+
+def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it():
+    """All four bays of `twins` look the same; the walk knows the two on the left."""
+    with gym.make("rfl/RangefinderMaze-v0", layout="twins") as env:
+        log = record(env, 20_000, hold=3, seed=1)
+    assert log.ground_truth[:, 0].max() < 650
+    agent = Agent(SMALL).fit(log)
+    node = agent.recognize(log.observations)
+    place = np.array([log.ground_truth[node == k].mean(0) for k in range(agent.num_nodes)])
+    starts = [(x, y) for x in (640.0, 800.0, 960.0, 1100.0) for y in (60.0, 230.0, 320.0, 400.0)]
+    goals = [(60.0, 400.0), (450.0, 250.0), (500.0, 60.0), (400.0, 130.0)]
+    reached = 0
+    with gym.make("rfl/RangefinderMaze-v0", layout="twins") as env:
+        for seed, (start, end) in enumerate(zip(starts, goals * 4, strict=True)):
+            goal = int(np.linalg.norm(place - end, axis=1).argmin())
+            agent.last_seen = None
+            observation, info = env.reset(options={"position": start})
+            executor = agent.executor(goal, seed=seed)
+            for _ in range(800):
+                action = executor.act(observation)
+                if executor.status != "running":
+                    break
+                observation, _, _, _, info = env.step(action)
+            away = np.linalg.norm(info["ground_truth"] - place[goal])
+            reached += executor.status == "reached" and bool(away < 44)
+    assert reached >= 15
