@@ -59,11 +59,15 @@ class Reach:
     num_steps: int = 10_000
     """Steps of a log; the one held 3 is twice as long."""
     practice: int = 20_000
-    """Steps of practice."""
+    """Steps of practice; 0 leaves it out."""
     strategies: bool = True
     """Practise by each goal strategy, not by the default one alone."""
     peer_steps: tuple[int, ...] = (10_000, 30_000, 100_000)
     """Environment steps of the peer; it needs the extra `reach`."""
+    sensor_noise: float = 0.0
+    """Largest share by which a reading is off, in logs and in tasks."""
+    motion_noise: float = 0.0
+    """Largest share by which a move is off."""
     peer_seeds: int = 1
     """Seeds that the peer gets; 100,000 steps take it half an hour."""
     out: Path = Path("runs/reach")
@@ -82,18 +86,23 @@ class Row(NamedTuple):
     """Environment steps that it learned from."""
     seconds: float
     """Seconds of learning, steps included."""
-    nodes: Share | None
-    """True success on node goals."""
     places: Share
     """True success on place goals."""
-    coverage: float
+    nodes: Share | None = None
+    """True success on node goals, one after the other; None without a map."""
+    anywhere: Share | None = None
+    """The same goals, each from a place of the whole room."""
+    coverage: float = np.nan
     """Share of the free cells within a node's reach; NaN without a map."""
-    wormholes: float
+    wormholes: float = np.nan
+    """Share of the steps in nodes that mix places."""
+    connected: float = np.nan
+    """Share of the nodes in the largest strongly connected component."""
 
 
 def benchmark_reach(config: Reach) -> None:
     """Run all contestants, print the table, write results.json and the plot."""
-    for name in ("seeds", "trials", "num_steps", "practice"):
+    for name in ("seeds", "trials", "num_steps"):
         cli.check_count(name, getattr(config, name))
     has_peer = importlib.util.find_spec("stable_baselines3") is not None
     if config.peer_steps and not has_peer:
@@ -109,12 +118,22 @@ def benchmark_reach(config: Reach) -> None:
     print(f"{config.out / 'results.json'}, {config.out / 'reach.png'}")
 
 
+def _make(config: Reach, layout: str) -> gym.Env:
+    return gym.make(
+        "rfl/RangefinderMaze-v0",
+        layout=layout,
+        sensor_noise=config.sensor_noise,
+        motion_noise=config.motion_noise,
+    )
+
+
 def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[Row]:
     """All contestants on one layout and seed."""
-    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
+    with _make(config, layout) as env:
         judge = Judge(env, layout, seed, config.trials)
         yield judge.random_walk()
-        yield judge.best_by_sight()
+        if not config.sensor_noise:
+            yield judge.best_by_sight()
         for name, times, hold, choices in (
             ("paper", 1, 1, AgentConfig.paper()),
             ("default, independent actions", 1, 1, AgentConfig()),
@@ -127,7 +146,8 @@ def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[
             yield judge.score(name, agent, [log], time.perf_counter() - begin)
         oracle = know_places(agent, log, seed)
         yield judge.score("oracle map, held 10", oracle, [log], 0.0)
-        for strategy in get_args(Strategy) if config.strategies else ("frontier",):
+        strategies = get_args(Strategy) if config.strategies else ("frontier",)
+        for strategy in strategies if config.practice else ():
             yield from _practise(config, judge, env, agent, log, strategy, seed)
         if has_peer and seed < config.seed + config.peer_seeds:
             yield from _run_peer(config, judge, layout, seed)
@@ -211,16 +231,19 @@ class Judge:
         nodes = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
         truth = scoring.ground_truth(logs)
         covered = scoring.coverage(scoring.maze_layout(self._env), truth, table)
+        scores = scoring.map_scores(agent, table, MAZE)
         return Row(
             name,
             self._layout,
             self._seed,
             sum(log.num_steps for log in logs),
             seconds,
-            self._run(agent, nodes, logs[-1].ground_truth),
             self._run(agent, self.places, None),
+            self._run(agent, nodes, logs[-1].ground_truth),
+            self._run(agent, scoring.from_anywhere(nodes, self._env, None, rng), None),
             covered["coverage_nodes"],
-            scoring.wormhole_share(table),
+            scores["wormhole_share"],
+            scores["strongly_connected_share"],
         )
 
     def _run(self, agent: Agent, tasks: list[Task], truth: Any) -> Share:
@@ -231,7 +254,7 @@ class Judge:
     def peer(self, name: str, num_steps: int, seconds: float, act: Callable[..., Any]) -> Row:
         """Let `act(observation, goal) -> action` do the places; near at any time counts."""
         places = _share([self._comes_near(task, act) for task in self.places])
-        return Row(name, self._layout, self._seed, num_steps, seconds, None, places, np.nan, np.nan)
+        return Row(name, self._layout, self._seed, num_steps, seconds, places)
 
     def best_by_sight(self) -> Row:
         """What nobody surpasses in the mean who knows the room and is told what a place looks like.
@@ -250,7 +273,7 @@ class Judge:
             tree = cKDTree(np.concatenate([cells[fits], task.target[None]]))
             best += max(len(near) for near in tree.query_ball_tree(tree, PLACE_TOLERANCE)) / tree.n
         places = wilson(round(best), len(self.places))
-        return Row("best by sight", self._layout, self._seed, 0, 0.0, None, places, np.nan, np.nan)
+        return Row("best by sight", self._layout, self._seed, 0, 0.0, places)
 
     def random_walk(self) -> Row:
         """Held random actions."""
@@ -321,7 +344,7 @@ def _run_peer(config: Reach, judge: Judge, layout: str, seed: int) -> Iterator[R
     """Train SAC with HER, and score it at each number of steps."""
     from stable_baselines3 import SAC, HerReplayBuffer
 
-    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
+    with _make(config, layout) as env:
         model = SAC(
             "MultiInputPolicy",
             GoalMaze(env, seed),
@@ -352,14 +375,15 @@ def _run_peer(config: Reach, judge: Judge, layout: str, seed: int) -> Iterator[R
 
 def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     """Rows pooled over seeds, one for each layout, contestant and number of steps."""
-    header = ["layout", "contestant", "steps", "logs", "node goals", "place goals", "coverage"]
-    header += ["wormholes", "seconds"]
+    header = ["layout", "contestant", "steps", "logs", "node goals", "from anywhere", "place goals"]
+    header += ["coverage", "wormholes", "connected", "seconds"]
     groups: dict[tuple[str, str, int], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.layout, row.name, row.num_steps), []).append(row)
     lines = []
     for (layout, name, steps), group in groups.items():
         nodes = [row.nodes for row in group if row.nodes is not None]
+        anywhere = [row.anywhere for row in group if row.anywhere is not None]
         lines.append(
             [
                 layout,
@@ -367,9 +391,11 @@ def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
                 str(steps),
                 str(len(group)),
                 str(_pool(nodes)) if nodes else "-",
+                str(_pool(anywhere)) if anywhere else "-",
                 str(_pool([row.places for row in group])),
                 _percent([row.coverage for row in group]),
                 _percent([row.wormholes for row in group]),
+                _percent([row.connected for row in group]),
                 f"{np.median([row.seconds for row in group]):.0f}",
             ]
         )
@@ -389,9 +415,11 @@ def _keep(config: Reach, rows: list[Row]) -> None:
     config.out.mkdir(parents=True, exist_ok=True)
     plain = [
         row._asdict()
-        | {"nodes": None if row.nodes is None else row.nodes._asdict()}
-        | {"places": row.places._asdict()}
-        | {name: _or_none(getattr(row, name)) for name in ("coverage", "wormholes")}
+        | {
+            name: None if (goals := getattr(row, name)) is None else goals._asdict()
+            for name in ("nodes", "anywhere", "places")
+        }
+        | {name: _or_none(getattr(row, name)) for name in ("coverage", "wormholes", "connected")}
         for row in rows
     ]
     with cli.replacing(config.out / "results.json") as new:
