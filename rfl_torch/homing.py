@@ -44,7 +44,7 @@ JUST_LIKE = 0.5 / LOOK_STEPS
 """Radii of a look from the goal within which the robot is there: half a full action."""
 
 LIKE = 0.35
-"""And where it comes no closer. What other places show may be less like the goal, and to see that
+"""And once it came no closer. What other places show may be less like the goal, and to see that
 takes a walk there and back."""
 
 AROUND = 6.0
@@ -90,6 +90,7 @@ class Homing:
         self.nodes: Labels = self._places[place].nodes
         self._is_near = self._agent.near[self.nodes].sum(0) > 0
         self._left, self._least, self._since, self._kick = APPROACH, np.inf, 0, 0
+        self._enough_here = self._enough
 
     def is_near(self, belief: Array) -> bool:
         """Whether a robot that has come to the place is still there, by its belief (N,)."""
@@ -112,9 +113,9 @@ class Homing:
         else:
             self._since += 1
         is_stuck = self._since >= STUCK
-        is_done = is_stuck or self._left == 0
-        self.is_there = away <= (max(LIKE, self._enough) if is_done else self._enough)
-        self.is_there |= is_done and self._is_last
+        if is_stuck or self._left == 0:
+            self._enough_here = max(LIKE, self._enough)
+        self.is_there = away <= self._enough_here or (self._left == 0 and self._is_last)
         if self.is_there:
             return None
         if self._left == 0:

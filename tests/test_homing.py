@@ -102,6 +102,14 @@ def test_where_it_comes_no_closer_what_is_like_the_goal_will_do():
     assert goes.is_there
 
 
+def test_what_is_like_the_goal_will_do_from_when_it_came_no_closer_on():
+    goes = homing(0.4, 0.5)
+    for _ in range(STUCK + 1):
+        assert goes.act(np.full(6, 0.5), 0) is not None
+    assert goes.act(np.full(6, 0.3), 0) is None
+    assert goes.is_there
+
+
 @pytest.mark.parametrize("best", [0, 1, 2])
 def test_if_none_is_like_it_the_one_most_like_it_is_gone_back_to(best):
     goes = homing(0.5, 0.5, 0.5)
@@ -116,7 +124,7 @@ def test_a_place_that_the_logs_saw_to_be_less_like_the_goal_is_not_tried():
     goes = homing(0.4, 1.1)
     stay(goes, 0.5)
     assert goes.nodes.tolist() == [0]
-    assert stay(goes, 0.6) == STUCK
+    assert stay(goes, 0.6) == APPROACH
     assert goes.is_there
 
 
