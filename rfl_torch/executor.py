@@ -170,9 +170,10 @@ class BeliefExecutor:
         self._seed = seed
         self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
         self._explorer: Explorer | None = None
+        self._is_exploring = False
         self.is_familiar = True
         self._recent: deque[bool] = deque(maxlen=LONGEST_DOUBT)
-        self._unfamiliar = self._weak = self._known = 0
+        self._unfamiliar = self._weak = self._known = self._plain = 0
         self._was_known = False
         self._sensors = Sensors(agent.hmm.obs_dim)
         self._reckoning = agent.reckoning
@@ -219,6 +220,8 @@ class BeliefExecutor:
         """Return the action of this control step, (A,), inside the action space."""
         action = self._decide(observation)
         self._note_action(action)
+        if self._explorer is not None and self._did is not None and not self._is_exploring:
+            self._explorer.watch(self._sensors.working(self._sensed), self._did)
         return action
 
     def _note_action(self, action: NDArray[np.float32] | None) -> None:
@@ -231,7 +234,7 @@ class BeliefExecutor:
     def _decide(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         self._sensed = sensible(self._agent.normalize(observation))
         normal = self._recognize(self._sensed)
-        is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._explorer is not None
+        is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._is_exploring
         seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
         is_homing = self._homing is not None and self._homing.is_near(self.belief)
         if self.status == "running" and (is_homing or (seems_there and self._trusts_sight())):
@@ -274,6 +277,7 @@ class BeliefExecutor:
             return self._search.act(normal)
         if self._explorer is None:
             self._explorer = self._agent.explorer(self._seed)
+        self._is_exploring = True
         return self._explorer.act(self._sensors.working(self._sensed))
 
     def _trusts_sight(self) -> bool:
@@ -362,17 +366,20 @@ class BeliefExecutor:
         self.belief = belief / belief.sum()
         self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
+        is_plain = bool(seen[self.node] >= self._agent.least_familiar)
         self._known = self._known + 1 if self.is_familiar else 0
-        if self._known >= CONFIRMED:
-            self._was_known = True
-            if self._knows_where:
-                self._explorer = None  # back on the map; a room that looks the same may not be
+        self._plain = self._plain + 1 if is_plain else 0
+        self._was_known |= self._known >= CONFIRMED
+        if self._plain >= CONFIRMED or (self._knows_where and self._known >= CONFIRMED):
+            self._is_exploring = False
+            if self._knows_where:  # else it may be a room that looks the same
+                self._explorer = None
         # What is wrong where it asks which place this is may be the place, not the sensor.
         is_asking = not self._knows_where and self.node in self._agent.telling
         if self.is_familiar and not is_asking:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
         self._ask_whether(before)
-        self._ask_where(before, bool(seen[self.node] >= self._agent.least_familiar))
+        self._ask_where(before, is_plain)
         return normal
 
     def _doubt(

@@ -24,6 +24,11 @@ NEAR_WALL = 15.0
 """Full actions within which the end of a free way is taken for a wall; the logs say less of how far
 a long way goes on."""
 
+BEYOND, BLIND = 5.0, 2.0
+"""Radii of a look by which the readings, on average, may be beyond all that the logs read, and full
+actions that each way is taken to be free if they are: of a hall, a log from a corridor's end can't
+tell how far its ways go."""
+
 BLOCKED_COST = 20.0
 """Cells that a detour may take rather than through one that is surely blocked. At 6 a robot probes
 walls for most of its time."""
@@ -99,6 +104,7 @@ class Explorer:
         self._low, self._high, self._free_ways = low, high, free_ways
         self._rng = np.random.default_rng(seed)
         self._ways = ways(len(low))
+        self._most_beyond = BEYOND * radius
         unit = radius / LOOK_STEPS
         self._lag = int(np.clip(np.ceil(free_ways.still / (NOISE_SHARE * unit)), 1, MOST_LAG))
         self._least = NOISE_MARGIN * free_ways.still + LEAST_CHANGE * unit * self._lag
@@ -141,6 +147,16 @@ class Explorer:
         share = (self._did + 1) / 2
         return (self._low + share * (self._high - self._low)).astype(np.float32)
 
+    def watch(self, normal: Array, did: Array) -> None:
+        """Count a step that is not its own.
+
+        Args:
+            normal: what is seen before it, (D,).
+            did: in full actions, (A,).
+        """
+        self._follow(normal)
+        self._did, self._path = did, []
+
     def _follow(self, normal: Array) -> None:
         """Count the last step, if it moved the robot, and look around in a new cell."""
         last = np.full_like(normal, 0.5) if self._did is None else self._seen
@@ -173,8 +189,11 @@ class Explorer:
 
     def _look_around(self, normal: Array) -> None:
         """Take note of the cells that look free, and of those behind."""
+        lengths = self._free_ways.at(normal)
+        if np.abs(normal - normal.clip(0.0, 1.0)).mean() > self._most_beyond:
+            lengths = np.full_like(lengths, BLIND)
         free, blocked = [], []
-        for way, length in zip(self._ways, self._free_ways.at(normal), strict=True):
+        for way, length in zip(self._ways, lengths, strict=True):
             free.append(self._along(way, 1.0, max(length - 1.0, 1.01)))
             if length < NEAR_WALL:
                 blocked.append(self._along(way, length + 1.0, length + 1.0 + CELL))

@@ -6,7 +6,7 @@ import pytest
 
 import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, record
-from rfl_torch.explorer import FINE, WIDE, Cells, Explorer
+from rfl_torch.explorer import BLIND, FINE, WIDE, Cells, Explorer
 from rfl_torch.free_ways import LONGEST, FreeWays, ways
 
 
@@ -73,6 +73,36 @@ def test_an_explorer_knows_where_it_is_though_walls_stood_in_its_way():
     search.act(room.see())
     rest = np.array([30, 10]) + search.position - room.position
     assert np.abs(rest).max() < 5  # a part of an action a wall
+
+
+def test_an_explorer_knows_where_it_is_after_steps_that_another_chose():
+    room, search, rng = Hook((30, 10)), explorer(), np.random.default_rng(0)
+    for step in range(200):
+        if step % 40 < 20:
+            room.do(search.act(room.see()))
+        else:
+            action = np.zeros(2)
+            action[step // 2 % 2] = rng.choice([-1.0, 1.0])
+            search.watch(room.see(), action)
+            room.do(action)
+    search.act(room.see())
+    rest = np.array([30, 10]) + search.position - room.position
+    assert np.abs(rest).max() < 5
+
+
+def test_readings_far_beyond_those_of_the_logs_tell_no_free_ways():
+    def steps(weight, gain):
+        room = Hook((30, 10))
+        search = Explorer(*BOUNDS, 2 * 0.6 / LONGEST, FreeWays(weight, 0.0), 0)
+        for _ in range(40):
+            room.do(search.act(gain * room.see()))
+        return room.position
+
+    blind = np.zeros((9, 8))
+    blind[-1] = BLIND
+    sees_all = np.concatenate([LONGEST * np.eye(8), np.zeros((1, 8))])
+    np.testing.assert_array_equal(steps(sees_all / 5, 5.0), steps(blind, 5.0))
+    assert np.abs(steps(sees_all, 1.0) - steps(blind, 1.0)).max() > 5
 
 
 def test_an_explorer_that_sees_nothing_of_free_ways_still_enters_new_cells():
