@@ -503,12 +503,18 @@ def test_a_robot_put_into_one_of_two_rooms_goes_to_see_which_it_is(plan, walk):
     assert reached == 4
 
 
-def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it():
-    """All four bays of `twins` look the same; the walk knows the two on the left."""
+@pytest.fixture(scope="module")
+def left_half():
+    """A log of `twins` that saw two of its four bays, and what was learned from it."""
     with gym.make("rfl/RangefinderMaze-v0", layout="twins") as env:
         log = record(env, 20_000, hold=3, seed=1)
     assert log.ground_truth[:, 0].max() < 650
-    agent = Agent(SMALL).fit(log)
+    return log, Agent(SMALL).fit(log)
+
+
+def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it(left_half):
+    """All four bays look the same."""
+    log, agent = left_half
     node = agent.recognize(log.observations)
     place = np.array([log.ground_truth[node == k].mean(0) for k in range(agent.num_nodes)])
     starts = [(x, y) for x in (640.0, 800.0, 960.0, 1100.0) for y in (60.0, 230.0, 320.0, 400.0)]
@@ -528,3 +534,24 @@ def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it():
             away = np.linalg.norm(info["ground_truth"] - place[goal])
             reached += executor.status == "reached" and bool(away < 44)
     assert reached >= 15
+
+
+def test_a_robot_is_done_exploring_where_what_it_sees_is_plainly_the_maps(left_half):
+    """Inside one of two bays that look the same it goes by the map to see which it is, and keeps
+    what it explored until it did."""
+    log, agent = left_half
+    is_telling = np.isin(agent.recognize(log.observations), agent.telling)
+    inside = int(np.flatnonzero(np.convolve(~is_telling, np.ones(30), "valid") == 30)[0])
+    agent.last_seen = None
+    executor = agent.executor(int(agent.telling[0]))
+    executor._is_exploring, executor._explorer = True, agent.explorer(0)
+    for step in range(inside, inside + 30):
+        executor.watch(log.observations[step], log.actions[step - 1])
+    assert not executor._is_exploring
+    assert not executor._knows_where
+    assert executor._explorer is not None
+    outside = inside + int(is_telling[inside:].argmax())
+    for step in range(inside + 30, outside + 30):
+        executor.watch(log.observations[step], log.actions[step - 1])
+    assert executor._knows_where
+    assert executor._explorer is None
