@@ -232,6 +232,9 @@ class Judge:
         truth = scoring.ground_truth(logs)
         covered = scoring.coverage(scoring.maze_layout(self._env), truth, table)
         scores = scoring.map_scores(agent, table, MAZE)
+        # Nodes first: what goes wrong on the way to a place that no log knows is remembered.
+        chained = self._run(agent, nodes, logs[-1].ground_truth)
+        anywhere = self._run(agent, scoring.from_anywhere(nodes, self._env, None, rng), None)
         return Row(
             name,
             self._layout,
@@ -239,8 +242,8 @@ class Judge:
             sum(log.num_steps for log in logs),
             seconds,
             self._run(agent, self.places, None),
-            self._run(agent, nodes, logs[-1].ground_truth),
-            self._run(agent, scoring.from_anywhere(nodes, self._env, None, rng), None),
+            chained,
+            anywhere,
             covered["coverage_nodes"],
             scores["wormhole_share"],
             scores["strongly_connected_share"],
