@@ -104,6 +104,8 @@ def benchmark_reach(config: Reach) -> None:
     """Run all contestants, print the table, write results.json and the plot."""
     for name in ("seeds", "trials", "num_steps"):
         cli.check_count(name, getattr(config, name))
+    if config.practice:
+        cli.check_count("practice", config.practice)
     has_peer = importlib.util.find_spec("stable_baselines3") is not None
     if config.peer_steps and not has_peer:
         print("SAC with HER left out: pip install 'rfl-torch[reach]'")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 import sims  # noqa: F401  registers the maze
+from experiments import scoring
 from rfl_torch import Agent, AgentConfig, Stage, Trajectory, places, record, repair
 from rfl_torch import memory as memory_module
 from rfl_torch.checkpoint import load_checkpoint
@@ -477,30 +478,27 @@ def test_a_goal_is_where_the_log_saw_what_is_most_like_it(late, half_path):
         assert set(goals) == set(agent.memory.node[away <= 0.1])
 
 
+def trials(agent, log, layout, starts, ends):
+    """Put down at each start without a memory, the robot goes to the node nearest to an end."""
+    table = scoring.node_table(agent, [log], scoring.MAZE)
+    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
+        for seed, (start, end) in enumerate(zip(starts, ends, strict=True)):
+            goal = int(np.linalg.norm(table.mean - end, axis=1).argmin())
+            agent.last_seen = None
+            task = scoring.Task(goal, table.mean[goal], np.array(start))
+            yield from scoring.run_tasks(env, agent, [task], scoring.MAZE, None, seed)
+
+
 def test_a_robot_put_into_one_of_two_rooms_goes_to_see_which_it_is(plan, walk):
     """Started in one bay and sent to the same or another place in either."""
     agent = Agent(SMALL).fit(walk.log)
-    path = agent.recognize(walk.log.observations)
-    truth = walk.log.ground_truth
-    place = np.array([truth[path == k].mean(0) for k in range(agent.num_nodes)])
     assert 0 < len(agent.telling) < agent.num_nodes
     bays = [(60.0, 400.0), (360.0, 400.0)]
-    reached = 0
-    with gym.make("rfl/RangefinderMaze-v0", layout=plan) as env:
-        for seed, (start, end) in enumerate(itertools.product(bays, bays)):
-            goal = int(np.linalg.norm(place - end, axis=1).argmin())
-            agent.last_seen = None
-            observation, info = env.reset(options={"position": start})
-            executor = agent.executor(goal, seed=seed)
-            for _ in range(800):
-                action = executor.act(observation)
-                if executor.status != "running":
-                    break
-                observation, _, _, _, info = env.step(action)
-            assert executor.status != "reached" or executor.node == goal
-            away = np.linalg.norm(info["ground_truth"] - place[goal])
-            reached += executor.status == "reached" and bool(away < 44)
-    assert reached == 4
+    starts, ends = zip(*itertools.product(bays, bays), strict=True)
+    done = list(trials(agent, walk.log, plan, starts, ends))
+    for trial in done:
+        assert not trial.outcome.is_believed or trial.outcome.nodes[-1] == trial.goal
+    assert sum(trial.is_true for trial in done) == 4
 
 
 @pytest.fixture(scope="module")
@@ -515,25 +513,10 @@ def left_half():
 def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it(left_half):
     """All four bays look the same."""
     log, agent = left_half
-    node = agent.recognize(log.observations)
-    place = np.array([log.ground_truth[node == k].mean(0) for k in range(agent.num_nodes)])
     starts = [(x, y) for x in (640.0, 800.0, 960.0, 1100.0) for y in (60.0, 230.0, 320.0, 400.0)]
-    goals = [(60.0, 400.0), (450.0, 250.0), (500.0, 60.0), (400.0, 130.0)]
-    reached = 0
-    with gym.make("rfl/RangefinderMaze-v0", layout="twins") as env:
-        for seed, (start, end) in enumerate(zip(starts, goals * 4, strict=True)):
-            goal = int(np.linalg.norm(place - end, axis=1).argmin())
-            agent.last_seen = None
-            observation, info = env.reset(options={"position": start})
-            executor = agent.executor(goal, seed=seed)
-            for _ in range(800):
-                action = executor.act(observation)
-                if executor.status != "running":
-                    break
-                observation, _, _, _, info = env.step(action)
-            away = np.linalg.norm(info["ground_truth"] - place[goal])
-            reached += executor.status == "reached" and bool(away < 44)
-    assert reached >= 15
+    ends = [(60.0, 400.0), (450.0, 250.0), (500.0, 60.0), (400.0, 130.0)] * 4
+    done = trials(agent, log, "twins", starts, ends)
+    assert sum(trial.is_true for trial in done) >= 15
 
 
 def test_a_robot_is_done_exploring_where_what_it_sees_is_plainly_the_maps(left_half):
