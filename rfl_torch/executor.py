@@ -236,11 +236,11 @@ class BeliefExecutor:
         normal = self._recognize(self._sensed)
         is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._is_exploring
         seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
-        is_homing = self._homing is not None and self._homing.is_near(self.belief)
+        is_homing = self._homing is not None and self._homing.has_begun
         if self.status == "running" and (is_homing or (seems_there and self._trusts_sight())):
             if self._homing is None:
                 self.status = "reached"
-            elif (action := self._go_home(self._homing, normal)) is not None:
+            elif (action := self._go_home(self._homing)) is not None:
                 return action
         if is_lost and self.status == "running":
             self.recovering = True
@@ -332,9 +332,12 @@ class BeliefExecutor:
         # What looks wrong there is off the map, if it isn't the senses that are wrong.
         self._astray = self._astray + 1 if is_telling and not self._knows_where else 0
 
-    def _go_home(self, homing: Homing, normal: NDArray[np.float64]) -> NDArray[np.float32] | None:
-        """The action by which the robot heads for its goal's own sight, (A,), if it goes on."""
-        action = homing.act(normal, self.node)
+    def _go_home(self, homing: Homing) -> NDArray[np.float32] | None:
+        """The action by which the robot heads for its goal's own sight, (A,), if it goes on.
+
+        It is not left to doubt which readings count: what is unlike its node may be like the goal.
+        """
+        action = homing.act(self._sensors.working(self._sensed), self.node)
         if homing.is_there:
             self.status = "reached"
         elif not len(homing.nodes):

@@ -5,6 +5,10 @@ what they saw elsewhere, as where a ray just misses a corner. So the robot goes 
 node on to the sight itself, and tries another place where that can't be seen.
 
     o_i + (y - p_i) G_i    what is seen at y around node i: G_i regressed on the nodes around it
+
+That leads to within some steps of the goal, not always there: where a ray slips past a corner what
+is seen jumps. How unlike the goal it is falls towards it all the same, so the last steps are tried
+one dimension and one way at a time (a pattern search, Hooke and Jeeves 1961).
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,10 +16,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rfl_torch.explorer import NOISE_MARGIN
+from rfl_torch.explorer import LEAST_CHANGE, NOISE_MARGIN
 from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.places import PLACE_STEPS
-from rfl_torch.search import LookSearch
 from rfl_torch.senses import apart
 
 if TYPE_CHECKING:
@@ -31,20 +34,26 @@ most like it. A corridor and its twin, 0.2 to 1 apart, are told apart so; identi
 PLACES = 3
 """That are tried. The first is right for 90 to 92 % of the places of a large hall, three for 96."""
 
-APPROACH = 30
+APPROACH = 60
 """Steps at a place until it is left for the next."""
 
-HOPE = 2.0
-"""Times as far as it came that what the logs saw elsewhere may be from the goal, to be tried."""
+HOPE = 2.5
+"""Radii of a look that what the logs saw elsewhere may be from the goal, to be tried."""
 
-STUCK, KICK, CLOSER = 6, 3, 0.02
-"""Steps in a row that lead no closer, by so many radii of a look, and random ones done then."""
+STUCK, CLOSER = 6, 0.02
+"""Steps in a row that lead no closer, by so many radii of a look, after which steps are tried."""
+
+SIZES = (1.0, 0.5)
+"""Full actions of the steps that are tried, one size after the other."""
 
 JUST_LIKE = 0.5 / LOOK_STEPS
 """Radii of a look from the goal within which the robot is there: half a full action."""
 
+BACK = 0.1
+"""Full actions from where it was best up to which it is back there."""
+
 LIKE = 0.35
-"""And once it came no closer. What other places show may be less like the goal, and to see that
+"""And once no step leads closer. What other places show may be less like the goal, and to see that
 takes a walk there and back."""
 
 AROUND = 6.0
@@ -72,15 +81,13 @@ class Homing:
         agent: whose map it is.
         sight: normalised readings of the goal, (D,).
         places: that most like it first.
-        seed: of the random steps.
     """
 
-    def __init__(self, agent: "Agent", sight: Array, places: list[Place], seed: int) -> None:
+    def __init__(self, agent: "Agent", sight: Array, places: list[Place]) -> None:
         self._agent, self._sight, self._places = agent, sight, places
-        low, high = agent.action_bounds
-        self._search = LookSearch(low, high, agent.look_radius, seed)
         still = 0.0 if agent.free_ways is None else agent.free_ways.still
-        self._enough = max(JUST_LIKE, NOISE_MARGIN * still / agent.look_radius)
+        self._noise = NOISE_MARGIN * still
+        self._enough = max(JUST_LIKE, self._noise / agent.look_radius)
         self._closest: list[float] = []
         self._is_last = False
         self.is_there = False
@@ -88,15 +95,19 @@ class Homing:
 
     def _go_to(self, place: int) -> None:
         self.nodes: Labels = self._places[place].nodes
-        self._is_near = self._agent.near[self.nodes].sum(0) > 0
-        self._left, self._least, self._since, self._kick = APPROACH, np.inf, 0, 0
-        self._enough_here = self._enough
+        self._left, self._least, self._since = APPROACH, np.inf, 0
+        self._probes: Probes | None = None
+        self._seen, self._did = self._sight, np.zeros(len(self._agent.rest_action))
+        self._off = self._did
+        """From where it was most like the goal, in full actions, by dead reckoning, (A,)."""
 
-    def is_near(self, belief: Array) -> bool:
-        """Whether a robot that has come to the place is still there, by its belief (N,)."""
-        if np.isinf(self._least):
-            return False
-        return bool(belief[self._is_near].sum() > 0.5)
+    @property
+    def has_begun(self) -> bool:
+        """Whether the robot came to the place; its belief counts no more then.
+
+        Between sights of the logs there are some that no node explains, or another node does.
+        """
+        return bool(np.isfinite(self._least))
 
     def act(self, normal: Array, node: int) -> NDArray[np.float32] | None:
         """Return the action of this step, (A,); None if it `is_there`, or `nodes` are others now.
@@ -108,26 +119,35 @@ class Homing:
             node: where the robot is.
         """
         away = apart(normal, self._sight) / self._agent.look_radius
-        if away < self._least - CLOSER:
-            self._least, self._since = away, 0
-        else:
-            self._since += 1
-        is_stuck = self._since >= STUCK
-        if is_stuck or self._left == 0:
-            self._enough_here = max(LIKE, self._enough)
-        self.is_there = away <= self._enough_here or (self._left == 0 and self._is_last)
+        is_closer = away < self._least - CLOSER
+        self._off = np.zeros_like(self._off) if is_closer else self._off + self._moved(normal)
+        self._since = 0 if is_closer else self._since + 1
+        self._least = away if is_closer else self._least
+        if self._probes is None and self._since >= STUCK:
+            self._probes = Probes(len(self._off))
+        step = None if self._probes is None else self._probes.next(self._off, is_closer)
+        is_over = self._left == 0 or (self._probes is not None and step is None)
+        enough = max(LIKE, self._enough) if is_over else self._enough
+        self.is_there = away <= enough or (is_over and self._is_last)
         if self.is_there:
             return None
-        if self._left == 0:
+        if is_over:
             self._leave()
             return None
         self._left -= 1
-        if is_stuck:
-            self._since, self._kick = 0, KICK
-        if self._kick > 0:
-            self._kick -= 1
-            return self._search.act(normal)
-        return self._agent.control_to_sight(normal, node, self._sight)
+        if step is None:
+            action = self._agent.control_to_sight(normal, node, self._sight)
+        else:
+            action = self._agent.raw_action((step + 1.0) / 2.0)
+        self._seen = normal
+        self._did = 2.0 * self._agent.unit_actions(action).astype(np.float64) - 1.0
+        return action
+
+    def _moved(self, normal: Array) -> Array:
+        """How far the last step went, in full actions, (A,): not at all if nothing changed."""
+        usual = float(np.abs(self._did).max()) * self._agent.look_radius / LOOK_STEPS
+        is_still = apart(normal, self._seen) < self._noise + LEAST_CHANGE * usual
+        return np.zeros_like(self._did) if is_still else self._did
 
     def _leave(self) -> None:
         """Take the next place that may be more like the goal than those that were tried.
@@ -137,7 +157,7 @@ class Homing:
         self._closest.append(self._least)
         num, best = len(self._closest), int(np.argmin(self._closest))
         least = self._closest[best]
-        if num < len(self._places) and self._places[num].away <= HOPE * least:
+        if num < len(self._places) and self._places[num].away <= HOPE:
             self._go_to(num)
         elif least <= 1.0:
             self._is_last = True
@@ -145,6 +165,38 @@ class Homing:
             self._go_to(best)
         else:
             self.nodes = np.empty(0, np.int64)
+
+
+class Probes:
+    """Tries steps from where it was best: on where one leads closer, else back and another way.
+
+    Args:
+        dim: A.
+    """
+
+    def __init__(self, dim: int) -> None:
+        self._ways = np.concatenate([np.eye(dim), -np.eye(dim)])
+        self._sizes = list(SIZES)
+        self._way, self._num_failed = -1, -1
+
+    def next(self, off: Array, is_closer: bool) -> Array | None:
+        """Return the next step, in full actions, (A,); None once none leads closer.
+
+        Args:
+            off: from where it was best, in full actions, (A,).
+            is_closer: whether it is better here than ever before.
+        """
+        if is_closer:
+            self._num_failed = 0
+        elif np.abs(off).max() > BACK:
+            return -off.clip(-1.0, 1.0)
+        else:
+            self._way = (self._way + 1) % len(self._ways)
+            self._num_failed += 1
+        if self._num_failed == len(self._ways):
+            self._num_failed = 0
+            self._sizes.pop(0)
+        return self._sizes[0] * self._ways[self._way] if self._sizes else None
 
 
 def places_like(
@@ -163,7 +215,8 @@ def places_like(
     places: list[Place] = []
     while len(places) < PLACES and np.isfinite(away.min()):
         first = node[away.argmin()]
-        alike = np.setdiff1d(node[away <= away.min() + SAME_SIGHT], first)
+        same = min(SAME_SIGHT, LIKE - away.min())
+        alike = np.setdiff1d(node[away <= away.min() + same], first)
         nodes = np.append(first, alike)
         places.append(Place(nodes, float(away.min())))
         apart_from = np.linalg.norm(positions[:, None] - positions[nodes], axis=2).min(1)
