@@ -633,7 +633,7 @@ class Agent:
         prob = self.hmm.log_transition().exp().detach().numpy()[rows, columns]
         seen = seen_edges(self.edges, self.is_reversible)
         self.alike = self._look_alikes(seen)
-        self.near = places.within(self.edges, places.NEAR)
+        self.near = places.surroundings(self.edges, self.positions)
         self.twins = self._twins()
         self.telling = places.find_telling(self.twins, self.edges)
         self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)

@@ -445,6 +445,25 @@ def within(edges: csr_array, most: int) -> csr_array:
     return csr_array(near > 0)
 
 
+def surroundings(edges: csr_array, positions: Array | None) -> csr_array:
+    """Nodes that are one and the same place's surroundings, bool (N, N).
+
+    Those NEAR edges apart at most, and, where nodes have positions, those not farther apart than a
+    node is long: no log may have gone from one to the other.
+
+    Args:
+        edges: how often the logs took each, (N, N).
+        positions: of the nodes, in full actions, (N, A); None if actions don't add up to any.
+    """
+    near = within(edges, NEAR)
+    if positions is None:
+        return near
+    i, j = cKDTree(positions).query_pairs(NODE_STEPS, output_type="ndarray").T
+    pairs = (np.concatenate([i, j]), np.concatenate([j, i]))
+    beside = csr_array((np.ones(len(pairs[0]), bool), pairs), shape=near.shape)
+    return csr_array(near + beside > 0)
+
+
 def find_telling(twins: csr_array, edges: csr_array) -> Labels:
     """Nodes at which a robot can tell where it is: no place looks like them, as far as is known.
 

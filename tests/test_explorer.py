@@ -8,6 +8,7 @@ import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, record
 from rfl_torch.explorer import BLIND, FINE, WIDE, Cells, Explorer
 from rfl_torch.free_ways import LONGEST, FreeWays, ways
+from rfl_torch.places import NEAR, NODE_STEPS, within
 
 
 @functools.cache
@@ -155,6 +156,14 @@ def test_who_completes_a_map_finds_something_new_nearer_than_who_is_lost():
     for search in (lost, fine):
         search.act(seen)
     assert 0 < fine.cells_to_new < lost.cells_to_new
+
+
+def test_what_lies_beside_a_node_is_its_surroundings_though_no_log_went_there():
+    _, agent = learned()
+    apart = np.linalg.norm(agent.positions[:, None] - agent.positions, axis=2)
+    beside = apart <= NODE_STEPS
+    assert agent.near.toarray()[beside].all()
+    assert not within(agent.edges, NEAR).toarray()[beside].all()
 
 
 def test_an_explorer_says_how_far_it_is_to_what_is_new():

@@ -260,6 +260,18 @@ def test_twins_look_the_same_and_are_not_near_each_other():
     assert near.tolist() == (np.abs(np.subtract.outer(range(10), range(10))) <= 2).tolist()
 
 
+def test_surroundings_are_what_few_edges_or_a_short_way_lead_to():
+    rng = np.random.default_rng(0)
+    edges = csr_array((rng.uniform(size=(60, 60)) < 0.02).astype(float))
+    positions = rng.uniform(0, 40, (60, 2))
+    by_edges = places.within(edges, places.NEAR).toarray()
+    apart = np.linalg.norm(positions[:, None] - positions, axis=2)
+    near = places.surroundings(edges, positions).toarray()
+    np.testing.assert_array_equal(near, by_edges | (apart <= places.NODE_STEPS))
+    assert (near & ~by_edges).sum() > 10
+    np.testing.assert_array_equal(places.surroundings(edges, None).toarray(), by_edges)
+
+
 def test_a_robot_can_tell_where_it_is_between_rooms_that_look_the_same_not_deep_in_one():
     edges = csr_array(np.diag(np.ones(29), 1))
     twins = np.zeros((30, 30), bool)
