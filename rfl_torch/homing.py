@@ -52,9 +52,9 @@ JUST_LIKE = 0.5 / LOOK_STEPS
 BACK = 0.1
 """Full actions from where it was best up to which it is back there."""
 
-LIKE = 0.35
-"""And once no step leads closer. What other places show may be less like the goal, and to see that
-takes a walk there and back."""
+TWIN = 0.35
+"""Radii of a look from the goal up to which places that are about as like it are tried as one, the
+nearest first. What is less like it is like it by chance."""
 
 AROUND = 6.0
 """Full actions from a node to those that tell most of what is seen around it."""
@@ -127,8 +127,7 @@ class Homing:
             self._probes = Probes(len(self._off))
         step = None if self._probes is None else self._probes.next(self._off, is_closer)
         is_over = self._left == 0 or (self._probes is not None and step is None)
-        enough = max(LIKE, self._enough) if is_over else self._enough
-        self.is_there = away <= enough or (is_over and self._is_last)
+        self.is_there = away <= self._enough or (is_over and self._is_last)
         if self.is_there:
             return None
         if is_over:
@@ -215,7 +214,7 @@ def places_like(
     places: list[Place] = []
     while len(places) < PLACES and np.isfinite(away.min()):
         first = node[away.argmin()]
-        same = min(SAME_SIGHT, LIKE - away.min())
+        same = min(SAME_SIGHT, TWIN - away.min())
         alike = np.setdiff1d(node[away <= away.min() + same], first)
         nodes = np.append(first, alike)
         places.append(Place(nodes, float(away.min())))
