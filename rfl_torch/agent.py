@@ -846,20 +846,20 @@ class Agent:
 
     def control(self, normal: NDArray[np.float64], node: int) -> NDArray[np.float32]:
         """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,)."""
-        return self.raw_action(self._unit_control(normal, node))
+        return self._raw_action(self._unit_control(normal, node))
 
     def control_to_sight(
         self, normal: NDArray[np.float64], node: int, sight: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """The action by which a robot at a node heads for where it sees a sight (D,), (A,)."""
         if self.positions is None:
-            return self.raw_action(self._unit_control(normal, node, sight))
+            return self._raw_action(self._unit_control(normal, node, sight))
         around = self._around(node)
         node = int(around[np.nansum(np.abs(self._mean[around] - normal), 1).argmin()])
         around = self._around(node)
         where, means = self.positions[around], self._mean[around]
         move = move_to_sight(sight - normal, means - self._mean[node], where - self.positions[node])
-        return self.raw_action((move + 1.0) / 2.0)
+        return self.action_of_move(move)
 
     def control_by_reckoning(
         self, normal: NDArray[np.float64], node: int, here: int, where: NDArray[np.float64]
@@ -878,7 +878,7 @@ class Agent:
             for seen in (normal, self._mean[here])
         )
         full = mend(action, asked, self.positions[node] - where)
-        return self.raw_action((full + 1.0) / 2.0)
+        return self.action_of_move(full)
 
     def _around(self, node: int) -> NDArray[np.int64]:
         return np.asarray(self.near.indices[self.near.indptr[node] : self.near.indptr[node + 1]])
@@ -892,8 +892,16 @@ class Agent:
         row = np.concatenate([observation, target], dtype=np.float32, casting="same_kind")
         return self.bank.at(row, node)
 
-    def raw_action(self, unit: NDArray[np.floating]) -> NDArray[np.float32]:
-        """From [0, 1], (A,), to the action space; what lies outside is shortened, not bent.
+    def action_of_move(self, move: NDArray[np.float64]) -> NDArray[np.float32]:
+        """The action (A,) of a move (A,) in full actions; what is longer is shortened, not bent."""
+        return self._raw_action((move + 1.0) / 2.0)
+
+    def move_of_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """An action (A,) in full ones, in [-1, 1], (A,)."""
+        return 2.0 * self.unit_actions(action).astype(np.float64) - 1.0
+
+    def _raw_action(self, unit: NDArray[np.floating]) -> NDArray[np.float32]:
+        """From [0, 1] to the action space; what lies outside is shortened, not bent.
 
         A controller that overflows, far from all that it learned from, says nothing: rest.
         """

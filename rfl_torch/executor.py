@@ -226,10 +226,7 @@ class BeliefExecutor:
 
     def _note_action(self, action: NDArray[np.float32] | None) -> None:
         """Remember what was done, in full actions."""
-        if action is None:
-            self._did = None
-        else:
-            self._did = 2.0 * self._agent.unit_actions(action).astype(np.float64) - 1.0
+        self._did = None if action is None else self._agent.move_of_action(action)
 
     def _decide(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         self._sensed = sensible(self._agent.normalize(observation))

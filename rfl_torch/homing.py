@@ -137,9 +137,9 @@ class Homing:
         if step is None:
             action = self._agent.control_to_sight(normal, node, self._sight)
         else:
-            action = self._agent.raw_action((step + 1.0) / 2.0)
+            action = self._agent.action_of_move(step)
         self._seen = normal
-        self._did = 2.0 * self._agent.unit_actions(action).astype(np.float64) - 1.0
+        self._did = self._agent.move_of_action(action)
         return action
 
     def _moved(self, normal: Array) -> Array:

@@ -459,9 +459,8 @@ def surroundings(edges: csr_array, positions: Array | None) -> csr_array:
     if positions is None:
         return near
     i, j = cKDTree(positions).query_pairs(NODE_STEPS, output_type="ndarray").T
-    pairs = (np.concatenate([i, j]), np.concatenate([j, i]))
-    beside = csr_array((np.ones(len(pairs[0]), bool), pairs), shape=near.shape)
-    return csr_array(near + beside > 0)
+    beside = csr_array((np.ones(len(i), bool), (i, j)), shape=near.shape)
+    return csr_array(near + beside + beside.T > 0)
 
 
 def find_telling(twins: csr_array, edges: csr_array) -> Labels:

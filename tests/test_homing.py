@@ -73,8 +73,8 @@ def homing(*aways):
         rest_action=np.zeros(2, np.float32),
         look_radius=1.0,
         free_ways=None,
-        unit_actions=lambda action: (action + 1) / 2,
-        raw_action=lambda unit: 2 * unit - 1,
+        move_of_action=np.float64,
+        action_of_move=np.float32,
         control_to_sight=lambda normal, node, sight: np.zeros(2, np.float32),
     )
     return Homing(agent, np.zeros(6), [Place(np.array([k]), away) for k, away in enumerate(aways)])
