@@ -45,8 +45,26 @@ def test_free_ways_are_known_where_the_log_did_not_go():
     assert np.median(np.abs(free - beyond[:, 3] * LONGEST)) < 3
 
 
+def mean_change(noise):
+    """Of a difference of two normal numbers, the mean is 2 / sqrt(pi) times their deviation."""
+    return 2 / np.sqrt(np.pi) * noise
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_the_change_of_readings_at_a_wall_is_their_noise(noise):
     still = learn(*walk(noise=noise)).still
-    # Of a difference of two normal numbers, the mean is 2 / sqrt(pi) times their deviation.
-    assert still == pytest.approx(2 / np.sqrt(np.pi) * noise, rel=0.3, abs=2e-3)
+    assert still == pytest.approx(mean_change(noise), rel=0.3, abs=2e-3)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_in_an_open_room_the_change_of_readings_in_short_steps_is_their_noise(noise):
+    """Who took noise for motion would go on against the first wall forever."""
+    track, seen, shift, actions = walk(noise=noise)
+    asked = 2 * actions.astype(np.float64) - 1
+    is_free = np.abs(shift - asked).max(1) < 1e-6  # as if nothing had ever stood in the way
+    free = np.flatnonzero(is_free)
+    seen_before, seen_after = seen[:-1][free], seen[1:][free]
+    pairs = [np.stack(both) for both in zip(seen_before, seen_after, strict=True)]
+    tracks = [track[[k, k + 1]] for k in free]
+    learned = learn_free_ways(tracks, pairs, list(shift[free, None]), list(actions[free, None]))
+    assert learned.still == pytest.approx(mean_change(noise), rel=0.3, abs=2e-3)
