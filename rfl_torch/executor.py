@@ -264,9 +264,11 @@ class BeliefExecutor:
             return self._search.act(normal)
         if self._reckoning is None:
             return self._agent.control(normal, self._next)
-        return self._agent.control_by_reckoning(
-            normal, self._next, self.node, self._where[self.node]
-        )
+        where = self._where[self.node]
+        if 2 * self._steps_left < self._config.patience and self._next != self.node:
+            # A node of few steps taught its controller little: beside it, it may go to and fro.
+            return self._agent.action_of_move(self._reckoning.positions[self._next] - where)
+        return self._agent.control_by_reckoning(normal, self._next, self.node, where)
 
     def _search_map(self, normal: NDArray[np.float64]) -> NDArray[np.float32]:
         """Look for what is known."""

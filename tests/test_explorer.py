@@ -166,6 +166,24 @@ def test_what_lies_beside_a_node_is_its_surroundings_though_no_log_went_there():
     assert not within(agent.edges, NEAR).toarray()[beside].all()
 
 
+def test_where_controllers_lead_nowhere_a_robot_goes_by_dead_reckoning(monkeypatch):
+    log, agent = learned()
+    start, goal = 2000, int(agent.memory.node[3000])
+    with gym.make("rfl/RangefinderMaze-v0", layout="paper", max_episode_steps=-1) as env:
+        observation, info = env.reset(options={"position": tuple(log.ground_truth[start])})
+        agent.last_seen = None
+        executor = agent.executor(goal)
+        monkeypatch.setattr(agent, "control_by_reckoning", lambda *_: agent.rest_action)
+        for _ in range(500):
+            action = executor.act(observation)
+            assert not executor.recovering
+            if executor.status != "running":
+                break
+            observation, _, _, _, info = env.step(action)
+    assert executor.status == "reached"
+    assert np.linalg.norm(info["ground_truth"] - log.ground_truth[3000]) < 44
+
+
 def test_an_explorer_says_how_far_it_is_to_what_is_new():
     room, search = Hook((30, 10)), explorer()
     search.act(room.see())
