@@ -85,10 +85,10 @@ STRANGE = 3.0
 """Weight of a step that saw what was never seen near a place. At a right start 4 in a hundred do,
 at one in the wrong of two rooms that look alike, 43."""
 
-COMES_BACK = 0.15
-"""How far a track is, when it comes back to a look, from the nearest place of that look, over how
-far any other step is: medians. In mazes it is 0.03 to 0.07, for pendulums and cars 0.6 to 1.6, and
-0.2 in rooms of ten by ten actions, where everything is near."""
+COMES_BACK, NEARER = 3.0, 0.3
+"""Full actions that a track may be, when it comes back to a look, from the nearest place of that
+look, and share of how far any other step is from it: medians. In mazes it is 1.2 to 2.7, a look's
+reach, and 0.03 to 0.28 by their size; for pendulums, cars and robots that turn 3.2 and more."""
 
 SHOWN = 0.5
 """Least share of the actions' variance that shows in the shifts, for actions to lead somewhere. In
@@ -157,7 +157,7 @@ def follow_track(
     """
     shifts, shown, grip = find_shifts(looks, observations, unit_actions, radius)
     hold = np.clip((grip / PLAIN) ** 2, LEAST_HOLD, 1.0)
-    come_to = KnownPlaces(*hold.shape)
+    come_to = KnownPlaces(hold)
     starts = [] if known is None or not len(known) else find_known_starts(known, shifts)
     parts = []
     for k, (look, shift) in enumerate(zip(looks, shifts, strict=True)):
@@ -171,9 +171,15 @@ def follow_track(
 
 
 class KnownPlaces:
-    """The places that a track has come to: a look and a position each."""
+    """The places that a track has come to: a look and a position each.
 
-    def __init__(self, num_looks: int, dim: int) -> None:
+    Args:
+        hold: how much each look holds the track along each dimension, (L, A), 1 where moves show.
+    """
+
+    def __init__(self, hold: Array) -> None:
+        num_looks, dim = hold.shape
+        self._hold = hold
         self.look: list[int] = []
         self._of_look: list[list[int]] = [[] for _ in range(num_looks)]
         self._sum = np.zeros((64, dim))
@@ -229,7 +235,7 @@ class KnownPlaces:
         if not self._returns:
             return False
         away, others = np.median(self._returns, axis=0)
-        return bool(away < COMES_BACK * others)
+        return bool(away < min(COMES_BACK, NEARER * others))
 
     def _away(self, look: int, here: Array) -> float:
         """Distance of a position from the nearest place of a look, which has one."""
@@ -246,7 +252,7 @@ class KnownPlaces:
             nearest = int(away.argmin())
         if places and away[nearest] < PLACE_STEPS:
             node = places[nearest]
-            here = here + PULL * (middle[nearest] - here)
+            here = here + PULL * self._hold[look] * (middle[nearest] - here)
         else:
             node = len(self.look)
             self.look.append(look)
@@ -267,7 +273,7 @@ class KnownPlaces:
         dim = shift.shape[1]
         if not self.look:
             return np.zeros(dim)
-        own = KnownPlaces(len(self._of_look), dim)
+        own = KnownPlaces(self._hold)
         own.follow(look, shift, np.zeros(dim))
         pairs = [(i, j) for j, one in enumerate(own.look) for i in self._of_look[one]]
         if not pairs:

@@ -18,7 +18,7 @@ from rfl_torch import memory as memory_module
 from rfl_torch.checkpoint import load_checkpoint
 from rfl_torch.free_ways import ways
 from rfl_torch.frontier import AHEAD, untried
-from rfl_torch.looks import find_looks, look_radius
+from rfl_torch.looks import LOOK_REACH, find_looks, look_radius
 from rfl_torch.shifts import find_shifts
 from sims.layouts import load_layout
 
@@ -70,9 +70,9 @@ class Walk(NamedTuple):
         )
 
 
-def walk_in(layout, num_steps, seed=0):
-    with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
-        log = record(env, num_steps, hold=10, seed=seed)
+def walk_in(layout, num_steps, seed=0, hold=10, **noise):
+    with gym.make("rfl/RangefinderMaze-v0", layout=layout, **noise) as env:
+        log = record(env, num_steps, hold=hold, seed=seed)
     low = log.observations.min(0)
     seen = ((log.observations - low) / np.ptp(log.observations, axis=0)).astype(np.float64)
     actions = [(log.actions + 1) / 2]
@@ -127,7 +127,7 @@ def test_shifts_in_rooms_that_look_the_same_are_what_was_moved(walk):
 
 def test_a_log_does_not_begin_where_what_it_saw_is_strange():
     """It fits 100 steps of a known room but for 50, and 5 steps before an unknown one."""
-    known = places.KnownPlaces(6, 1)
+    known = places.KnownPlaces(np.ones((6, 1)))
     known.follow(*stops((0, 0, 100), (1, 10, 100), (2, 20, 100), (5, 100, 5)), np.zeros(1))
     look, shift = stops((5, 0, 5), (0, 20, 50), (1, 30, 50), (3, 40, 50))
     assert known.find_start(look, shift) == pytest.approx(100.0, abs=1.0)
@@ -193,6 +193,38 @@ def test_a_track_is_believed_only_if_what_was_asked_for_shows_in_it(walk, monkey
         assert walk.track().comes_back == is_believed
 
 
+def test_a_track_is_believed_only_if_looks_are_found_where_they_were(walk, monkeypatch):
+    """That is within a look's reach, and much nearer than anywhere else."""
+    track = walk.track()
+    known = places.KnownPlaces(track.hold)
+    known.follow(track.looks[0], track.shifts[0], np.zeros(2))
+    away, others = np.median(known._returns, axis=0)
+    assert away < LOOK_REACH < others / 4
+    assert known.comes_back()
+    for name, found in (("COMES_BACK", away), ("NEARER", away / others)):
+        with monkeypatch.context() as changed:
+            changed.setattr(places, name, 0.99 * found)
+            assert not known.comes_back()
+            changed.setattr(places, name, 1.01 * found)
+            assert known.comes_back()
+
+
+def test_a_track_of_independent_noisy_steps_comes_back_too():
+    noisy = walk_in("paper", 10_000, seed=2, hold=1, sensor_noise=0.05, motion_noise=0.1)
+    assert noisy.track().comes_back
+
+
+def test_a_place_pulls_the_track_no_more_than_moves_show_there():
+    """All looks the same: the sum of the shifts is pulled to their mean, or it isn't."""
+    look, shift = np.zeros(2001, np.int64), np.full((2000, 1), 0.003)
+    ends = {
+        hold: places.KnownPlaces(np.full((1, 1), hold)).follow(look, shift, np.zeros(1))[0][-1, 0]
+        for hold in (0.0, 0.03, 1.0)
+    }
+    assert ends[0.0] == pytest.approx(6.0)
+    assert 1.0 < ends[1.0] < 4.0 < ends[0.03] < 6.0
+
+
 def test_a_robot_that_only_goes_round_never_comes_back():
     """Each time around is farther on."""
     rng = np.random.default_rng(0)
@@ -210,9 +242,9 @@ def test_a_track_that_drifted_off_the_map_is_moved_back_once_known_looks_agree()
     known = [*range(60), *range(60, 0, -1)]
     look = np.array([*known * 3, *range(90), *range(90, 0, -1), *known])
     shift = np.diff(look).astype(np.float64)[:, None]
-    straight, _ = places.KnownPlaces(91, 1).follow(look, shift, np.zeros(1))
+    straight, _ = places.KnownPlaces(np.ones((91, 1))).follow(look, shift, np.zeros(1))
     shift[360 + 75] += 12.0
-    track, node = places.KnownPlaces(91, 1).follow(look, shift, np.zeros(1))
+    track, node = places.KnownPlaces(np.ones((91, 1))).follow(look, shift, np.zeros(1))
     assert (node[-120:] == node[:120]).all()
     back = slice(360 + 90 + 31, 360 + 180)  # from where it is on the map again
     assert (node[back] == node[59:0:-1][: 180 - 90 - 31]).all()
