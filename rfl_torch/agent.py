@@ -635,7 +635,7 @@ class Agent:
         self.alike = self._look_alikes(seen)
         self.near = places.surroundings(self.edges, self.positions)
         self.twins = self._twins()
-        self.telling = places.find_telling(self.twins, self.edges)
+        self.telling = places.find_telling(self.twins, self.edges, self.positions)
         self.graph = csr_array(seen.multiply(self._steps_between(seen)) + self.alike)
         self.map_cost = self.graph.data.copy()  # executors raise the graph's where they fail
         self.transition_in = self._with_hops(csr_array((prob, (rows, target)), shape=shape))
@@ -674,7 +674,8 @@ class Agent:
         """Places that look the same, (N, N); none but in a map rebuilt by places."""
         if self.counts is None or not self.is_reversible:
             return csr_array((self.num_nodes, self.num_nodes), dtype=bool)
-        return places.find_twins(*self._emissions(), self.edges)
+        near = places.surroundings(self.edges, self.positions, places.PLACE_STEPS)
+        return places.find_twins(*self._emissions(), near)
 
     def _emissions(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Means and scales of the nodes, (N, D) each, and the power of their densities."""

@@ -407,17 +407,17 @@ def _gather(looks: list[Labels], tracks: list[Array]) -> list[Labels]:
     return np.split(node, _starts(looks)[1:])
 
 
-def find_twins(mean: Array, scale: Array, power: float, edges: csr_array) -> csr_array:
+def find_twins(mean: Array, scale: Array, power: float, near: csr_array) -> csr_array:
     """Pairs of nodes that look the same at different places, bool (N, N).
 
     Args:
         mean: of the nodes, (N, D).
         scale: of the nodes, (N, D).
         power: of the emission densities.
-        edges: how often the log took each, (N, N).
+        near: pairs that are at one place, bool (N, N).
     """
     alike = look_alikes(mean, scale, power, TWINS)
-    return csr_array(alike - alike.multiply(within(edges, NEAR)) > 0)
+    return csr_array(alike - alike.multiply(near) > 0)
 
 
 def match_twins(twins: csr_array, mean: Array, scale: Array, edges: csr_array) -> csr_array:
@@ -451,52 +451,85 @@ def within(edges: csr_array, most: int) -> csr_array:
     return csr_array(near > 0)
 
 
-def surroundings(edges: csr_array, positions: Array | None) -> csr_array:
+def surroundings(edges: csr_array, positions: Array | None, most: float = NODE_STEPS) -> csr_array:
     """Nodes that are one and the same place's surroundings, bool (N, N).
 
-    Those NEAR edges apart at most, and, where nodes have positions, those not farther apart than a
-    node is long: no log may have gone from one to the other.
+    Those NEAR edges apart at most, and, where nodes have positions, those not far apart: no log may
+    have gone from one to the other.
 
     Args:
         edges: how often the logs took each, (N, N).
         positions: of the nodes, in full actions, (N, A); None if actions don't add up to any.
+        most: full actions that they may be apart.
     """
     near = within(edges, NEAR)
     if positions is None:
         return near
-    i, j = cKDTree(positions).query_pairs(NODE_STEPS, output_type="ndarray").T
+    i, j = cKDTree(positions).query_pairs(most, output_type="ndarray").T
     beside = csr_array((np.ones(len(i), bool), (i, j)), shape=near.shape)
     return csr_array(near + beside + beside.T > 0)
 
 
-def find_telling(twins: csr_array, edges: csr_array) -> Labels:
+def find_telling(twins: csr_array, edges: csr_array, positions: Array | None) -> Labels:
     """Nodes at which a robot can tell where it is: no place looks like them, as far as is known.
 
-    What was seen in one of two rooms alone may be in the other too. What both lead to is not: of
-    the parts of the map without twins, those count that two nodes that look the same lie beside,
-    or the larger ones if none does. Of their nodes, those NEAR edges away from all twins, if there
-    are any. All nodes, if there are no twins, or if nothing is left.
+    What lies behind one of two places that look the same may lie behind the other too, if no log
+    went on there. So of the parts of the map without twins those count beside which, for more than
+    a half, it is known what lies there beside the twin; or the larger ones if there is none. Of
+    their nodes, those NEAR edges away from all twins, if there are any. All nodes, if there are no
+    twins, or if nothing is left.
+
+    Args:
+        twins: pairs of nodes that look the same, (N, N).
+        edges: how often the logs took each, (N, N).
+        positions: of the nodes, in full actions, (N, A); None if actions don't add up to any.
     """
     has_twin = twins.sum(1) > 0
-    (twin,) = np.nonzero(has_twin)
-    room = np.full(len(has_twin), -1)
-    room[twin] = connected_components(edges[twin][:, twin], directed=False)[1]
-    first, second = room[np.array(twins.nonzero())]
-    pairs = np.unique(np.stack([first, second], 1)[first != second], axis=0)
+    if not has_twin.any():
+        return np.arange(len(has_twin))
     alone, part = _parts(edges, has_twin, 1)
-    inside = csr_array((np.ones(len(alone)), (part, alone)), (part.max(initial=-1) + 1, len(room)))
-    beside = (inside @ within(edges, 2)).toarray() > 0
-    told = [
-        k for k, near in enumerate(beside) if np.isin(pairs, room[near & has_twin]).all(1).any()
-    ]
     far, far_part = _parts(edges, has_twin, NEAR)
-    if told:
-        between = alone[np.isin(part, told)]
-        return np.intersect1d(between, far) if np.isin(between, far).any() else between
-    if not has_twin.any() or not len(far):
+    told = alone[_is_told(alone, part, twins, edges, positions)[part]]
+    if len(told):
+        return np.intersect1d(told, far) if np.isin(told, far).any() else told
+    if not len(far):
         return np.arange(len(has_twin))
     size = np.bincount(far_part)[far_part]
     return np.asarray(far[2 * size >= size.max()])
+
+
+def _is_told(
+    alone: Labels, part: Labels, twins: csr_array, edges: csr_array, positions: Array | None
+) -> NDArray[np.bool_]:
+    """Whether it is known what lies beside the twins of what each part lies beside, (P,).
+
+    It is where the part lies beside the twin too, and where a node is as far from the twin, in the
+    same direction, as the part is from the other.
+
+    Args:
+        alone: nodes without twins, (M,).
+        part: that each is in, (M,).
+        twins: pairs of nodes that look the same, (N, N).
+        edges: how often the logs took each, (N, N).
+        positions: of the nodes, (N, A), or None.
+    """
+    first, second = twins.nonzero()
+    twin, number = np.unique(first, return_inverse=True)
+    room = connected_components(edges[twin][:, twin], directed=False)[1]
+    own, other = room[number], room[np.searchsorted(twin, second)]
+    pair, inside = within(edges, 2)[first][:, alone].nonzero()
+    beside = part[inside]
+    leads_to = np.zeros((int(part.max(initial=-1)) + 1, int(room.max()) + 1), bool)
+    leads_to[beside, own[pair]] = True
+    is_known = (own != other)[pair] & leads_to[beside, other[pair]]
+    if positions is not None:
+        way = positions[alone[inside]] - positions[first[pair]]
+        away, _ = cKDTree(positions).query(positions[second[pair]] + way)
+        is_known |= away <= NODE_STEPS / 2
+    num, num_known = (
+        np.bincount(beside, weight, len(leads_to)) for weight in (None, is_known.astype(float))
+    )
+    return np.asarray(num_known > num / 2)
 
 
 def _parts(edges: csr_array, has_twin: NDArray[np.bool_], away: int) -> tuple[Labels, Labels]:

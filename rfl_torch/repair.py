@@ -188,10 +188,11 @@ def tie(counts: Counts, power: float, min_scale: float) -> Counts:
     weight = np.maximum(counts.weight, 1.0)
     mean = counts.first / weight
     scale = np.sqrt(np.maximum(counts.second / weight - mean**2, min_scale**2))
-    twins = places.find_twins(mean, scale, power, counts.edges)
+    near = places.within(counts.edges, places.NEAR)
+    twins = places.find_twins(mean, scale, power, near)
     twins = places.match_twins(twins, mean, scale, counts.edges)
     pool = csr_array(twins + eye_array(counts.num_nodes))
-    edges = (pool @ counts.edges @ pool).multiply(places.within(counts.edges, places.NEAR))
+    edges = (pool @ counts.edges @ pool).multiply(near)
     return Counts(
         csr_array(edges), *(pool @ x for x in (counts.weight, counts.first, counts.second))
     )

@@ -286,8 +286,13 @@ def test_twins_look_the_same_and_are_not_near_each_other():
     mean = np.array([0, 1, 2, 3, 4, 4, 6, 2, 1, 0], np.float64)[:, None]
     scale = np.full((10, 1), 0.01)
     edges = csr_array(np.diag(np.ones(9), 1))
-    twins = places.find_twins(mean, scale, 1.0, edges)
+    twins = places.find_twins(mean, scale, 1.0, places.within(edges, places.NEAR))
     assert np.argwhere(np.triu(twins.toarray())).tolist() == [[0, 9], [1, 8], [2, 7]]
+    positions = np.arange(10.0)[:, None] * 4
+    positions[9] = 6  # a log came by beside 1 and 2, and no log went from one to the other
+    near = places.surroundings(edges, positions, places.PLACE_STEPS)
+    twins = places.find_twins(mean, scale, 1.0, near)
+    assert np.argwhere(np.triu(twins.toarray())).tolist() == [[1, 8], [2, 7]]
     near = places.within(edges, 2).toarray()
     assert near.tolist() == (np.abs(np.subtract.outer(range(10), range(10))) <= 2).tolist()
 
@@ -304,27 +309,68 @@ def test_surroundings_are_what_few_edges_or_a_short_way_lead_to():
     np.testing.assert_array_equal(places.surroundings(edges, None).toarray(), by_edges)
 
 
+class Bays(NamedTuple):
+    """A corridor of 11 nodes with a bay at either end, as far as a log went into each.
+
+    Nodes are 4 full actions apart; as far as both bays are known they look the same.
+    """
+
+    positions: NDArray[np.float64]
+    edges: csr_array
+    twins: csr_array
+
+    @classmethod
+    def of(cls, depths, num_alike):
+        corridor = [(4.0 * k, 0.0) for k in range(11)]
+        bays = [
+            [(end, -4.0 * (k + 1)) for k in range(depth)]
+            for end, depth in zip((0.0, 40.0), depths, strict=True)
+        ]
+        positions = np.array(corridor + bays[0] + bays[1])
+        apart = np.abs(positions[:, None] - positions).sum(2)
+        twins = np.zeros((len(positions),) * 2, bool)
+        for k in range(num_alike):
+            pair = (11 + k, 11 + depths[0] + k)
+            twins[pair] = twins[pair[::-1]] = True
+        return cls(positions, csr_array(apart == 4.0) * 1.0, csr_array(twins))
+
+    def telling(self):
+        return places.find_telling(self.twins, self.edges, self.positions).tolist()
+
+
 def test_a_robot_can_tell_where_it_is_between_rooms_that_look_the_same_not_deep_in_one():
+    """What is deep in one may be deep in the other too, where no log went."""
+    assert Bays.of((12, 4), 4).telling() == [3, 4, 5, 6, 7]  # NEAR edges from either bay
+    assert Bays.of((4, 12), 4).telling() == [3, 4, 5, 6, 7]
+
+
+def test_a_robot_can_tell_where_it_is_deep_in_a_room_once_its_twin_is_known_as_deep():
+    deep = [*range(11 + 7, 11 + 12), *range(23 + 7, 23 + 12)]
+    assert Bays.of((12, 12), 4).telling() == [3, 4, 5, 6, 7, *deep]
+
+
+def test_a_robot_can_tell_where_it_is_almost_anywhere_if_few_nodes_look_the_same_by_chance():
+    """Two of one long corridor: on either side of both it is known what lies there."""
+    twins = np.zeros((31, 31), bool)
+    twins[14, 16] = twins[16, 14] = True
+    corridor = np.arange(31.0)[:, None] * 4
+    edges = csr_array(np.diag(np.ones(30), 1))
+    telling = places.find_telling(csr_array(twins), edges, corridor)
+    assert telling.tolist() == [*range(11), *range(20, 31)]
+
+
+def test_without_positions_a_robot_can_tell_where_it_is_between_rooms_or_in_the_largest_part():
     edges = csr_array(np.diag(np.ones(29), 1))
     twins = np.zeros((30, 30), bool)
     twins[3, 20] = twins[20, 3] = True  # 0-1 and 22-29 may be in the other room too
-    assert places.find_telling(csr_array(twins), edges).tolist() == list(range(7, 17))
-    twins[26, 9] = twins[9, 26] = True
-    assert places.find_telling(csr_array(twins), edges).tolist() == [
-        13,
-        14,
-        15,
-        16,
-    ]  # no two of a pair
-
-
-def test_a_robot_that_passes_no_rooms_can_tell_where_it_is_in_the_larger_part_away_from_twins():
-    edges = csr_array(np.diag(np.ones(29), 1))
-    twins = np.zeros((30, 30), bool)
-    twins[3, 4] = twins[4, 3] = True  # two of one room
-    assert places.find_telling(csr_array(twins), edges).tolist() == list(range(8, 30))
+    assert places.find_telling(csr_array(twins), edges, None).tolist() == list(range(7, 17))
+    twins[26, 9] = twins[9, 26] = True  # what lies between those two pairs, not between others
+    assert places.find_telling(csr_array(twins), edges, None).tolist() == [13, 14, 15, 16]
+    one_room = np.zeros((30, 30), bool)
+    one_room[3, 4] = one_room[4, 3] = True
+    assert places.find_telling(csr_array(one_room), edges, None).tolist() == list(range(8, 30))
     none = csr_array((30, 30), dtype=bool)
-    assert places.find_telling(none, edges).tolist() == list(range(30))
+    assert places.find_telling(none, edges, None).tolist() == list(range(30))
 
 
 def test_of_several_twins_the_most_alike_one_is_matched():
@@ -332,7 +378,7 @@ def test_of_several_twins_the_most_alike_one_is_matched():
     mean = np.array([0, 1, 2, 3, 50, 51, 52, 53, 54, 55, 0.1, 1.1, 2.1, 3.1])[:, None]
     scale = np.full((14, 1), 1.0)
     edges = csr_array(np.diag(np.ones(13), 1))
-    twins = places.find_twins(mean, scale, 1.0, edges)
+    twins = places.find_twins(mean, scale, 1.0, places.within(edges, places.NEAR))
     assert twins.toarray()[0].sum() > 1
     matched = places.match_twins(twins, mean, scale, edges).toarray()
     assert (matched == matched.T).all()
