@@ -24,6 +24,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, triu
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 
 from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.planner import look_alikes
@@ -52,6 +53,12 @@ PULL = 0.01
 
 SHIFT_ERROR, PLACE_WIDTH = 0.02, 2.0
 """Standard deviations, in full actions, of a shift and of a step from its place's middle."""
+
+USUAL, LARGEST = 1.5, 5.0
+"""Misfit up to which a shift is as good as any, and how many times the error of those a shift may
+have whose readings fit worse: it grows with the misfit's square. A step that slid around a corner
+is off by a third of an action; a few such steps laid all that came after on a second sheet, beside
+the first. Without a limit a hall shrinks in such steps."""
 
 PLAIN, LEAST_HOLD = 0.2, 0.03
 """Share of a full action's usual change of the readings by which a move shows plainly, and what a
@@ -102,6 +109,8 @@ class Track(NamedTuple):
     """(T+1,) each, of every observation."""
     shifts: list[Array]
     """(T, A) each, in full actions."""
+    errors: list[Array]
+    """(T,) each, in full actions: standard deviations of the shifts."""
     followed: list[Array]
     """(T+1, A) each, in full actions."""
     nodes: list[Labels]
@@ -122,20 +131,24 @@ class Track(NamedTuple):
         short: there it is relaxed anew with nodes for places.
         """
         holds = [self.hold[look] for look in self.looks]
-        tracks = relax(self.nodes, self.shifts, self.followed, holds)
+        tracks = relax(self.nodes, self.shifts, self.followed, self.errors, holds)
+        # What drifted apart and now lies together is one place: once more, with those.
+        nodes = _gather(self.looks, tracks, 2 * PLACE_STEPS)
+        tracks = relax(nodes, self.shifts, tracks, self.errors, holds)
         hardly_shows = [hold.min(1) < HARDLY for hold in holds]
         if not np.concatenate(hardly_shows).any():
             return tracks
-        own = [node + self.num_places for node in self.split(tracks)]
-        parts = zip(hardly_shows, own, self.nodes, strict=True)
+        num_places = 1 + max(int(node.max()) for node in nodes)
+        own = [node + num_places for node in self.split(tracks)]
+        parts = zip(hardly_shows, own, nodes, strict=True)
         _, flat = np.unique(
             np.concatenate([np.where(*part) for part in parts]), return_inverse=True
         )
-        return relax(np.split(flat, _starts(own)[1:]), self.shifts, tracks, holds)
+        return relax(np.split(flat, _starts(own)[1:]), self.shifts, tracks, self.errors, holds)
 
     def split(self, positions: list[Array]) -> list[Labels]:
         """Nodes, one for each look at each of the `positions`' places, int64 (T+1,) each."""
-        return _gather(self.looks, positions)
+        return _gather(self.looks, positions, NODE_STEPS)
 
 
 def follow_track(
@@ -155,10 +168,11 @@ def follow_track(
         known: nodes of the first of these steps, from when they were laid out last. Their logs
             begin where those say, the others where most of their looks were seen.
     """
-    shifts, shown, grip = find_shifts(looks, observations, unit_actions, radius)
+    shifts, misfit, shown, grip = find_shifts(looks, observations, unit_actions, radius)
+    errors = [SHIFT_ERROR * np.clip((own / USUAL) ** 2, 1.0, LARGEST) for own in misfit]
     hold = np.clip((grip / PLAIN) ** 2, LEAST_HOLD, 1.0)
     come_to = KnownPlaces(hold)
-    starts = [] if known is None or not len(known) else find_known_starts(known, shifts)
+    starts = [] if known is None or not len(known) else find_known_starts(known, shifts, errors)
     parts = []
     for k, (look, shift) in enumerate(zip(looks, shifts, strict=True)):
         start = starts[k] if k < len(starts) else come_to.find_start(look, shift)
@@ -167,7 +181,7 @@ def follow_track(
     used, flat = np.unique(np.concatenate(nodes), return_inverse=True)  # some were moved away from
     nodes = np.split(flat, _starts(nodes)[1:])
     comes_back = come_to.comes_back() and shown > SHOWN
-    return Track(looks, shifts, tracks, nodes, len(used), comes_back, hold)
+    return Track(looks, shifts, errors, tracks, nodes, len(used), comes_back, hold)
 
 
 class KnownPlaces:
@@ -305,7 +319,7 @@ class KnownPlaces:
         return float(steps[known].sum() - STRANGE * steps[strange].sum())
 
 
-def find_known_starts(known: Labels, shifts: list[Array]) -> list[Array]:
+def find_known_starts(known: Labels, shifts: list[Array], errors: list[Array]) -> list[Array]:
     """Where the logs begin of whose steps nodes (M,) are known, (A,) each; the first at 0.
 
     All of them at once, by the shifts and by the nodes that they have in common: a log inside one
@@ -322,7 +336,7 @@ def find_known_starts(known: Labels, shifts: list[Array]) -> list[Array]:
     far = 100 * PLACE_STEPS + sum(np.abs(shift).sum() for shift in shifts)
     dim = shifts[0].shape[1]
     apart = [np.full((num, dim), far * own) for num, own in zip(length, part, strict=True)]
-    tracks = relax(np.split(node, np.cumsum(length)[:-1]), shifts, apart)
+    tracks = relax(np.split(node, np.cumsum(length)[:-1]), shifts, apart, errors)
     return [track[0] - tracks[0][0] for track in tracks[:num_logs]]
 
 
@@ -342,6 +356,7 @@ def relax(
     nodes: list[Labels],
     shifts: list[Array],
     tracks: list[Array],
+    errors: list[Array],
     holds: list[Array] | None = None,
 ) -> list[Array]:
     """Tracks that agree best with the shifts and with a position for each place, by least squares.
@@ -350,6 +365,7 @@ def relax(
         nodes: places of every step of each log, (T+1,).
         shifts: (T, A) each.
         tracks: as followed, (T+1, A) each.
+        errors: standard deviations of the shifts, (T,) each.
         holds: how much each step's place holds it along each dimension, (T+1, A) each; 1 if None.
     """
     node, track = np.concatenate(nodes), np.concatenate(tracks)
@@ -361,8 +377,9 @@ def relax(
     chain = _differences(before, before + 1, size)
     place = _differences(num_steps + node, step, size)
     loose = np.concatenate([np.full(num_steps, LOOSE), np.zeros(num_nodes)])
-    stiff = chain.T @ chain / SHIFT_ERROR**2 + diags_array(loose)
-    right = chain.T @ np.concatenate(shifts) / SHIFT_ERROR**2
+    pull = chain.T @ diags_array(np.concatenate(errors) ** -2.0)
+    stiff = pull @ chain + diags_array(loose)
+    right = pull @ np.concatenate(shifts)
     right[:num_steps] += LOOSE * track
     solved = np.empty_like(track)
     for axis, own in enumerate(hold.T):
@@ -391,8 +408,8 @@ def _starts(parts: list[Labels]) -> Labels:
     return np.cumsum([0] + [len(part) for part in parts[:-1]])
 
 
-def _gather(looks: list[Labels], tracks: list[Array]) -> list[Labels]:
-    """Number the places: steps of one look, no two farther apart than NODE_STEPS on the track."""
+def _gather(looks: list[Labels], tracks: list[Array], most: float) -> list[Labels]:
+    """Number the places: steps of one look, no two of them more than `most` apart on the track."""
     look, track = np.concatenate(looks), np.concatenate(tracks)
     node, num_nodes = np.empty(len(look), np.int64), 0
     for steps in np.split(look.argsort(kind="stable"), np.bincount(look).cumsum()[:-1]):
@@ -401,7 +418,7 @@ def _gather(looks: list[Labels], tracks: list[Array]) -> list[Labels]:
         spot, inverse = np.unique(track[steps].round(), axis=0, return_inverse=True)
         place = np.ones(1, np.int64)
         if len(spot) > 1:
-            place = fcluster(linkage(spot, "complete"), NODE_STEPS, "distance").astype(np.int64)
+            place = fcluster(linkage(pdist(spot), "complete"), most, "distance").astype(np.int64)
         node[steps] = num_nodes + place[inverse.ravel()] - 1
         num_nodes += int(place.max())
     return np.split(node, _starts(looks)[1:])

@@ -52,12 +52,15 @@ class Shifts(NamedTuple):
     """How far each step of some logs went.
 
     steps: in full actions, (T, A) for each log.
+    misfit: how much the readings changed otherwise than such a move changes them, over the median,
+        (T,) for each log. A step that slid around a corner has much, and is wrong.
     shown: share of the actions' variance that the changes of the readings show.
     grip: how much a full action along each dimension changes what is seen at each look, over what
         full actions usually change, at most 1, (L, A).
     """
 
     steps: list[Array]
+    misfit: list[Array]
     shown: float
     grip: Array
 
@@ -87,6 +90,7 @@ def find_shifts(
     _, told = np.unique((middle / (FINE * unit)).round(), axis=0, return_index=True)
     told_apart = middle[told]
     shift, measured = np.empty_like(action), np.empty_like(action)
+    misfit = np.empty(len(action))
     grip = np.ones((max(int(own.max()) for own in looks) + 1, action.shape[1]))
     for own, steps in enumerate(
         np.split(look.argsort(kind="stable"), np.bincount(look).cumsum()[:-1])
@@ -102,11 +106,13 @@ def find_shifts(
         moved = _likeliest(seen, asked, *_what_shows(moved, seen, unit))
         shown, noise = _what_shows(moved, seen, unit)
         shift[steps] = _likeliest(change[steps], action[steps], shown, noise)
+        misfit[steps] = (np.abs(change[steps] - shift[steps] @ shown) / noise).mean(1)
         grip[own] = np.minimum(1.0, np.abs(shown).mean(1) / unit)
     measured /= np.maximum(1.0, np.abs(measured).max(1, keepdims=True))
     share = 1.0 - float(((action - measured) ** 2).sum() / max((action**2).sum(), 1e-12))
-    parts = np.split(shift, np.cumsum([len(part) for part in unit_actions])[:-1])
-    return Shifts(parts, share, grip)
+    misfit /= max(float(np.median(misfit)), 1e-12)
+    ends = np.cumsum([len(part) for part in unit_actions])[:-1]
+    return Shifts(np.split(shift, ends), np.split(misfit, ends), share, grip)
 
 
 def _ridge(inputs: Array, outputs: Array, penalty: float) -> Array:

@@ -168,7 +168,8 @@ def test_known_logs_begin_where_their_nodes_say():
     paths = [begin + once for begin in begins]
     known = np.unique(np.concatenate(paths), return_inverse=True)[1]
     shifts = [np.diff(path).astype(np.float64)[:, None] for path in [*paths, np.arange(9)]]
-    starts = np.concatenate(places.find_known_starts(known, shifts))
+    errors = [np.full(len(shift), places.SHIFT_ERROR) for shift in shifts]
+    starts = np.concatenate(places.find_known_starts(known, shifts, errors))
     assert len(starts) == 5
     np.testing.assert_allclose(starts[:3], begins[:3], atol=1e-3)
     assert starts[4] - starts[3] == pytest.approx(5, abs=1e-3)
@@ -257,10 +258,11 @@ def test_relaxed_tracks_are_the_least_squares():
     nodes = [rng.integers(4, size=12), rng.integers(4, size=9)]
     shifts = [rng.standard_normal((11, 2)), rng.standard_normal((8, 2))]
     tracks = [rng.standard_normal((12, 2)), rng.standard_normal((9, 2))]
+    errors = [places.SHIFT_ERROR * rng.uniform(1, 5, len(shift)) for shift in shifts]
     rows, right = [], []
-    for begin, node, shift, track in (
-        (0, nodes[0], shifts[0], tracks[0]),
-        (12, *(nodes[1], shifts[1], tracks[1])),
+    for begin, node, shift, track, error in (
+        (0, nodes[0], shifts[0], tracks[0], errors[0]),
+        (12, nodes[1], shifts[1], tracks[1], errors[1]),
     ):
         for t in range(len(node)):
             row = np.zeros(25)
@@ -274,11 +276,45 @@ def test_relaxed_tracks_are_the_least_squares():
             if t > 0:
                 row = np.zeros(25)
                 row[begin + t], row[begin + t - 1] = 1, -1
-                rows.append(row / places.SHIFT_ERROR)
-                right.append(shift[t - 1] / places.SHIFT_ERROR)
+                rows.append(row / error[t - 1])
+                right.append(shift[t - 1] / error[t - 1])
     expected = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
-    found = np.concatenate(places.relax(nodes, shifts, tracks))
+    found = np.concatenate(places.relax(nodes, shifts, tracks, errors))
     np.testing.assert_allclose(found, expected[:21], atol=1e-5)
+
+
+def drifted(error):
+    """A track to and fro on a line of 30 looks, a step apart, for long.
+
+    Halfway, four steps of standard deviation `error` count a step too far each, and all that came
+    after was taken for other places. Returns how far off the track is, and how much of those four
+    steps too many it took back there.
+    """
+    once = [*range(30), *range(28, 0, -1)]
+    look = np.array(once * 40)
+    half = len(look) // 2
+    shift = np.diff(look).astype(np.float64)[:, None]
+    errors = np.full(len(shift), places.SHIFT_ERROR)
+    shift[half : half + 4] += 1.0
+    errors[half : half + 4] = error
+    followed = np.concatenate([np.zeros((1, 1)), shift.cumsum(0)])
+    nodes = np.where(np.arange(len(look)) < half, look, 30 + look)
+    parts = ([look], [shift], [errors], [followed], [nodes])
+    (position,) = places.Track(*parts, 60, True, np.ones((30, 1))).positions()
+    off = position[:, 0] - look
+    taken_back = (shift - np.diff(position, axis=0))[half : half + 4].sum()
+    return np.abs(off - np.median(off[:half])), taken_back
+
+
+def test_what_drifted_apart_and_lies_together_again_is_one_place():
+    off, _ = drifted(0.1)
+    assert np.median(off) < 0.5
+    assert off[-1] < 1.0
+
+
+def test_a_track_is_wrong_where_its_shifts_may_be():
+    taken_back = [drifted(error)[1] for error in (0.1, places.SHIFT_ERROR)]
+    assert taken_back[0] > 1.0 > 3 * taken_back[1]
 
 
 def test_twins_look_the_same_and_are_not_near_each_other():
@@ -522,14 +558,12 @@ def test_a_hall_along_which_moves_hardly_show_is_as_long_as_it_is(tmp_path):
     y = log.ground_truth[:, 1] / 10
     is_halfway = np.abs(y - 70) < 25
     assert is_halfway.sum() > 1000
-    at_once = places.relax(
-        track.nodes, track.shifts, track.followed, [track.hold[look] for look in track.looks]
-    )
+    holds = [track.hold[look] for look in track.looks]
+    at_once = places.relax(track.nodes, track.shifts, track.followed, track.errors, holds)
     length = [
         np.polyfit(y[is_halfway], positions[0][is_halfway, 1], 1)[0]
         for positions in (track.positions(), at_once)
     ]
-    print(length)
     assert length[0] == pytest.approx(1.0, abs=0.04)
     assert length[1] < 0.94
 

@@ -22,22 +22,30 @@ def walk_in(layout, num_steps, hold, **noise):
     seen = [((log.observations - low) / span).astype(np.float64)]
     unit = [(log.actions + 1) / 2]
     radius = look_radius(seen, unit)
-    (shift,), share, _ = find_shifts(find_looks(seen, unit, radius), seen, unit, radius)
-    return shift, log.actions, np.diff(log.ground_truth, axis=0) / STEP, share
+    (shift,), (misfit,), share, _ = find_shifts(find_looks(seen, unit, radius), seen, unit, radius)
+    return shift, log.actions, np.diff(log.ground_truth, axis=0) / STEP, share, misfit
 
 
 @pytest.mark.parametrize(("layout", "hold"), [("twins", 1), ("hall", 1), ("paper", 10)])
 def test_shifts_are_what_was_moved_and_not_what_was_asked_for(layout, hold):
     """Within 0.01 of a full action a step; asked for was 0.01 to 0.1 more or less than moved."""
-    shift, asked, moved, _ = walk_in(layout, 6000, hold)
+    shift, asked, moved, *_ = walk_in(layout, 6000, hold)
     error = np.abs(shift - moved).mean()
     assert error < 0.01
     assert error < 0.3 * np.abs(asked - moved).mean()
     assert np.linalg.norm((shift - moved).sum(0)) < 10
 
 
+def test_a_shift_is_wrong_where_the_readings_do_not_fit_it():
+    shift, _, moved, _, misfit = walk_in("paper", 6000, 10)
+    error = np.linalg.norm(shift - moved, axis=1)
+    assert np.median(misfit) == pytest.approx(1.0)
+    assert np.square(error[misfit < 1.0]).mean() < 0.01**2
+    assert np.square(error[misfit > np.quantile(misfit, 0.99)]).mean() > 0.1**2
+
+
 def test_noise_is_told_from_walls():
-    shift, asked, moved, _ = walk_in("twins", 6000, 3, sensor_noise=0.05, motion_noise=0.1)
+    shift, asked, moved, *_ = walk_in("twins", 6000, 3, sensor_noise=0.05, motion_noise=0.1)
     # A tenth of motion noise leaves 0.02 to 0.03 a step, which adds up to nothing.
     assert np.abs(shift - moved).mean() < 0.05
     was_stopped = (np.abs(moved - asked) > 0.4).any(1)
@@ -57,7 +65,7 @@ def test_what_no_reading_shows_counts_as_done():
     seen = [(place[:, :1] + 20) / 40]
     unit = [((action + 1) / 2).astype(np.float32)]
     looks = [(seen[0][:, 0] * 19).round().astype(np.int64)]
-    (shift,), share, grip = find_shifts(looks, seen, unit, 0.05)
+    (shift,), _, share, grip = find_shifts(looks, seen, unit, 0.05)
     moved = np.diff(place, axis=0)
     assert np.abs(shift[:, 1] - action[:, 1]).max() < 1e-6
     # Shares are quarters, and a tenth of the steps end at a wall.
