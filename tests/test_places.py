@@ -1,5 +1,6 @@
 """Places that look the same, told apart by how far the robot went between them."""
 
+import copy
 import itertools
 import json
 from typing import NamedTuple
@@ -632,6 +633,16 @@ def left_half():
         log = record(env, 20_000, hold=3, seed=1)
     assert log.ground_truth[:, 0].max() < 650
     return log, Agent(SMALL).fit(log)
+
+
+def test_what_looks_the_same_within_a_place_is_no_twin(left_half):
+    agent = copy.deepcopy(left_half[1])
+    first, second = (ends[0] for ends in agent.twins.nonzero())
+    away = np.array([places.PLACE_STEPS, 0.0])
+    for share, is_twin in ((1.01, True), (0.99, False)):
+        agent.positions[second] = agent.positions[first] + share * away
+        agent._prepare_planning()
+        assert bool(agent.twins[first, second]) == is_twin
 
 
 def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it(left_half):
