@@ -15,6 +15,7 @@ doesn't come back.
 """
 
 from collections import deque
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -87,6 +88,9 @@ AWAY = 100
 
 MOST_STARTS = 10
 """Of a log, that are tried: those that most of its looks speak for."""
+
+CLEAR = 0.5
+"""Share of a log's steps at known looks that must agree with its start for no other to be asked."""
 
 STRANGE = 3.0
 """Weight of a step that saw what was never seen near a place. At a right start 4 in a hundred do,
@@ -173,12 +177,10 @@ def follow_track(
     errors = [SHIFT_ERROR * np.clip((own / USUAL) ** 2, 1.0, LARGEST) for own in misfit]
     hold = np.clip((grip / PLAIN) ** 2, LEAST_HOLD, 1.0)
     come_to = KnownPlaces(hold)
-    starts = [] if known is None or not len(known) else find_known_starts(known, shifts, errors)
-    parts = []
-    for k, (look, shift) in enumerate(zip(looks, shifts, strict=True)):
-        start = starts[k] if k < len(starts) else come_to.find_start(look, shift)
-        parts.append(come_to.follow(look, shift, start))
-    tracks, nodes = (list(part) for part in zip(*parts, strict=True))
+    starts: list[Array | None] = [None] * len(looks)
+    if known is not None and len(known):
+        starts = find_known_starts(known, shifts, errors)
+    tracks, nodes = come_to.follow_all(looks, shifts, starts)
     used, flat = np.unique(np.concatenate(nodes), return_inverse=True)  # some were moved away from
     nodes = np.split(flat, _starts(nodes)[1:])
     comes_back = come_to.comes_back() and shown > SHOWN
@@ -280,19 +282,63 @@ class KnownPlaces:
         self._count[node] += 1
         return node, here
 
-    def find_start(self, look: Labels, shift: Array) -> Array:
+    def follow_all(
+        self, looks: list[Labels], shifts: list[Array], starts: list[Array | None]
+    ) -> tuple[list[Array], list[Labels]]:
+        """Go along logs, first those whose `starts` are known; returns tracks and places of each.
+
+        The others follow in the order in which they show what is known by then: a log of a room
+        comes after the one that leads there, whichever was written first.
+        """
+        parts = [
+            None if start is None else self.follow(look, shift, start)
+            for look, shift, start in zip(looks, shifts, starts, strict=True)
+        ]
+        waiting = {
+            k: _Waiting(looks[k], shifts[k], self._hold) for k, part in enumerate(parts) if not part
+        }
+        while waiting:
+            k, start = self._next(waiting)
+            del waiting[k]
+            parts[k] = self.follow(looks[k], shifts[k], start)
+        tracks, nodes = zip(*(part for part in parts if part), strict=True)
+        return list(tracks), list(nodes)
+
+    def _next(self, waiting: dict[int, "_Waiting"]) -> tuple[int, Array]:
+        """Of the logs that wait, the one that agrees in most steps with what is known; its start.
+
+        The first that agrees in most of what it might is as good.
+        """
+        first = next(iter(waiting))
+        if not self.look:
+            return first, np.zeros(self._hold.shape[1])
+        num_places = np.array([len(own) for own in self._of_look])
+        might = {k: int(log.num_seen[num_places > 0].sum()) for k, log in waiting.items()}
+        order = sorted((k for k in waiting if might[k]), key=lambda k: -might[k])
+        best = None
+        for k in order:
+            log, num_known = waiting[k], int(num_places[waiting[k].num_seen > 0].sum())
+            if log.num_known != num_known:
+                log.num_known = num_known
+                log.start, log.agreement = self.find_start(log.places)
+            if best is None or log.agreement > waiting[best].agreement:
+                best = k
+            if log.agreement > CLEAR * might[k]:
+                break
+        if best is not None and waiting[best].agreement > 0:
+            return best, waiting[best].start
+        return first, self.position.max(0) + 100 * PLACE_STEPS + waiting[first].length
+
+    def find_start(self, own: "KnownPlaces") -> tuple[Array, float]:
         """Where a log must begin, (A,), for most of its looks to be seen at known places.
 
-        Out of reach of all that is known, if it shows no look that is.
+        Args:
+            own: places of the log, begun at 0, one of whose looks is known.
+
+        Returns:
+            The start, and the steps that agree with it, less those that don't.
         """
-        dim = shift.shape[1]
-        if not self.look:
-            return np.zeros(dim)
-        own = KnownPlaces(self._hold)
-        own.follow(look, shift, np.zeros(dim))
         pairs = [(i, j) for j, one in enumerate(own.look) for i in self._of_look[one]]
-        if not pairs:
-            return self.position.max(0) + 100 * PLACE_STEPS + np.abs(shift).sum()
         there, here = np.array(pairs).T
         offset = self.position[there] - own.position[here]
         vote = np.minimum(self._count[there], own._count[here])
@@ -303,7 +349,9 @@ class KnownPlaces:
             best = near[int(left.argmax())]
             starts.append(np.average(offset[best], axis=0, weights=vote[best]))
             left[best] = 0.0
-        return max(starts, key=lambda start: self._agreement(own, start))
+        agreement = [self._agreement(own, start) for start in starts]
+        best = int(np.argmax(agreement))
+        return starts[best], agreement[best]
 
     def _agreement(self, other: "KnownPlaces", start: Array) -> float:
         """Steps of another track, begun at `start`, that saw what is known to be seen there.
@@ -320,12 +368,33 @@ class KnownPlaces:
         return float(steps[known].sum() - STRANGE * steps[strange].sum())
 
 
-def find_known_starts(known: Labels, shifts: list[Array], errors: list[Array]) -> list[Array]:
-    """Where the logs begin of whose steps nodes (M,) are known, (A,) each; the first at 0.
+class _Waiting:
+    """A log that is to be laid out, and where it must begin by what is known so far."""
+
+    def __init__(self, look: Labels, shift: Array, hold: Array) -> None:
+        self._log = look, shift, hold
+        self.num_seen = np.bincount(look, minlength=len(hold))
+        self.length = float(np.abs(shift).sum())
+        self.num_known = 0  # places of its looks when it was asked last
+        self.start, self.agreement = np.zeros(hold.shape[1]), -np.inf
+
+    @cached_property
+    def places(self) -> KnownPlaces:
+        """Its own, begun at 0."""
+        look, shift, hold = self._log
+        own = KnownPlaces(hold)
+        own.follow(look, shift, np.zeros(hold.shape[1]))
+        return own
+
+
+def find_known_starts(
+    known: Labels, shifts: list[Array], errors: list[Array]
+) -> list[Array | None]:
+    """Where the logs begin of whose steps nodes (M,) are known, (A,) each; the first of them at 0.
 
     All of them at once, by the shifts and by the nodes that they have in common: a log inside one
-    of several rooms that look the same can't be found by its looks. Those that have no node in
-    common, even by others, are out of each other's reach.
+    of several rooms that look the same can't be found by its looks. None for those that have no
+    node in common with most of them, even by others, and for logs of whose steps none is known.
     """
     length = [len(shift) + 1 for shift in shifts]
     log = np.repeat(np.arange(len(shifts)), length)
@@ -334,11 +403,15 @@ def find_known_starts(known: Labels, shifts: list[Array], errors: list[Array]) -
     num_logs = int(log[len(known) - 1]) + 1
     seen_by = csr_array((np.ones(len(log)), (log, node)))
     _, part = connected_components(seen_by @ seen_by.T, directed=False)
-    far = 100 * PLACE_STEPS + sum(np.abs(shift).sum() for shift in shifts)
-    dim = shifts[0].shape[1]
-    apart = [np.full((num, dim), far * own) for num, own in zip(length, part, strict=True)]
-    tracks = relax(np.split(node, np.cumsum(length)[:-1]), shifts, apart, errors)
-    return [track[0] - tracks[0][0] for track in tracks[:num_logs]]
+    nowhere = [np.zeros((num, shifts[0].shape[1])) for num in length]
+    tracks = relax(np.split(node, np.cumsum(length)[:-1]), shifts, nowhere, errors)
+    most = np.bincount(part[:num_logs], weights=length[:num_logs]).argmax()
+    is_found = (part == most) & (np.arange(len(shifts)) < num_logs)
+    origin = tracks[int(is_found.argmax())][0]
+    return [
+        track[0] - origin if is_own else None
+        for track, is_own in zip(tracks, is_found, strict=True)
+    ]
 
 
 def _agreed(missed: deque[tuple[int, Array, bool]]) -> Array | None:
