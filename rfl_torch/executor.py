@@ -170,7 +170,8 @@ class BeliefExecutor:
         self._seed = seed
         self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
         self._explorer: Explorer | None = None
-        self._is_exploring = False
+        self._is_exploring = self._is_led = False
+        self._cut_off = 0
         self.is_familiar = True
         self._recent: deque[bool] = deque(maxlen=LONGEST_DOUBT)
         self._unfamiliar = self._weak = self._known = self._plain = 0
@@ -218,9 +219,10 @@ class BeliefExecutor:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action of this control step, (A,), inside the action space."""
+        self._is_led = False
         action = self._decide(observation)
         self._note_action(action)
-        if self._explorer is not None and self._did is not None and not self._is_exploring:
+        if self._explorer is not None and self._did is not None and not self._is_led:
             self._explorer.watch(self._sensors.working(self._sensed), self._did)
         return action
 
@@ -255,6 +257,11 @@ class BeliefExecutor:
                 self._head_for(targets)
             if self._is_proving and not np.isfinite(self._cost_to_go[self.node]):
                 self._landed = -1  # no way leads to what could prove it
+            is_cut_off = not np.isfinite(self._cost_to_go[self.node])
+            if self._landed < 0 and not is_cut_off:
+                self._cut_off = 0
+            if (is_cut_off or self._cut_off) and self._agent.free_ways is not None:
+                return self._look_for_a_way()
             self._choose_next()
         if self.status != "running":
             return self._agent.rest_action
@@ -277,7 +284,25 @@ class BeliefExecutor:
         if self._explorer is None:
             self._explorer = self._agent.explorer(self._seed)
         self._is_exploring = True
-        return self._explorer.act(self._sensors.working(self._sensed))
+        return self._explore(self._explorer)
+
+    def _look_for_a_way(self) -> NDArray[np.float32]:
+        """Explore on from a part of the map from which none is known, until another is proved."""
+        self.recovering, self._next = True, -1
+        self._cut_off += 1
+        if self._cut_off > LONGEST_SEARCH:
+            self.status = "gave_up"
+            self.reason = f"no way is known from here, nor found in {LONGEST_SEARCH} steps"
+            return self._agent.rest_action
+        if self._explorer is None:
+            self._explorer = self._agent.explorer(self._seed)
+        if self._cut_off in (1, CONFIRMED) and self._agent.positions is not None:
+            self._explorer.know(self._agent.positions - self._agent.positions[self.node])
+        return self._explore(self._explorer)
+
+    def _explore(self, explorer: Explorer) -> NDArray[np.float32]:
+        self._is_led = True
+        return explorer.act(self._sensors.working(self._sensed))
 
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar, not after many strange ones, and a jump was proved."""
@@ -374,7 +399,8 @@ class BeliefExecutor:
         self._was_known |= self._known >= CONFIRMED
         if self._plain >= CONFIRMED or (self._knows_where and self._known >= CONFIRMED):
             self._is_exploring = False
-            if self._knows_where:  # else it may be a room that looks the same
+            # Else it may be a room that looks the same, or one from which no way is known.
+            if self._knows_where and not self._cut_off:
                 self._explorer = None
         # What is wrong where it asks which place this is may be the place, not the sensor.
         is_asking = not self._knows_where and self.node in self._agent.telling

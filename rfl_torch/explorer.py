@@ -61,7 +61,7 @@ MARGIN = 16
 """Cells of which nothing is known that the lattice has on each side."""
 
 KNOWN_REACH = 200.0
-"""Full actions from the start within which known places are taken note of, for memory's sake."""
+"""Full actions from the robot within which known places are taken note of, for memory's sake."""
 
 MOST_CELLS = 1_000_000
 """Of the lattice. A robot that has come farther begins anew."""
@@ -126,7 +126,7 @@ class Explorer:
     def know(self, positions: Array) -> None:
         """Take places (N, A), counted in full actions from here, for known: none is new."""
         near = positions[np.abs(positions).max(1) <= KNOWN_REACH]
-        for cell in np.unique(_cell(near), axis=0):
+        for cell in np.unique(_cell(self.position + near), axis=0):
             self._cells.enter(cell)
 
     def act(self, normal: Array) -> NDArray[np.float32]:

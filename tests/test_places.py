@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 import sims  # noqa: F401  registers the maze
 from experiments import scoring
@@ -698,3 +699,26 @@ def test_a_robot_is_done_exploring_where_what_it_sees_is_plainly_the_maps(left_h
         executor.watch(log.observations[step], log.actions[step - 1])
     assert executor._knows_where
     assert executor._explorer is None
+
+
+def test_a_robot_in_a_part_of_the_map_from_which_no_way_is_known_finds_one(tmp_path):
+    """Logs of two rooms, none of which saw the door between them."""
+    plan, layout = {"size": [500, 240], "walls": [[250, 0, 250, 130]]}, tmp_path / "rooms.json"
+    layout.write_text(json.dumps(plan | {"start": [100, 100]}))
+    with gym.make("rfl/RangefinderMaze-v0", layout=str(layout)) as env:
+        walk = record(env, 8000, hold=3, seed=0)
+    room = np.sign(walk.ground_truth[:, 0] - 250) * (np.abs(walk.ground_truth[:, 0] - 250) > 70)
+    cuts = np.flatnonzero(np.diff(room)) + 1
+    begins, ends = np.append(0, cuts), np.append(cuts, len(room)) - 1
+    logs = [
+        part(walk, begin, end)
+        for begin, end in zip(begins, ends, strict=True)
+        if room[begin] and end - begin > 50
+    ]
+    agent = Agent(SMALL).fit(logs)
+    num_parts, piece = connected_components(agent.graph, connection="strong")
+    assert num_parts == 2
+    assert np.bincount(piece).min() > 40
+    starts, ends = [(60.0, 60.0), (440.0, 60.0)], [(400.0, 60.0), (100.0, 60.0)]
+    done = list(trials(agent, logs, layout, starts, ends))
+    assert [trial.is_true for trial in done] == [True, True]
