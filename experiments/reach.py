@@ -6,8 +6,8 @@ All are scored by ground truth, from independent starts, on the same places.
 
 The peer is Stable-Baselines3's SAC with hindsight experience replay: the same 24 ranges, the goal's
 ranges, and the ranges reached instead as hindsight goals. It counts as there if it comes near the
-goal at any time, since it has no word for "reached". Its episodes begin anywhere in the room, which
-no robot with a log can have.
+goal at any time, since it has no word for "reached". Its episodes begin anywhere in the room, as
+those of the contestant with 20 logs do; the others' only log begins where the layout says.
 """
 
 import copy
@@ -29,7 +29,14 @@ from tqdm import tqdm
 import sims
 from experiments import cli, figures, scoring
 from experiments.scoring import MAZE, PLACE_TOLERANCE, Share, Task, wilson
-from rfl_torch import Agent, AgentConfig, InnateController, Trajectory, record
+from rfl_torch import (
+    Agent,
+    AgentConfig,
+    InnateController,
+    Trajectory,
+    record,
+    record_episodes,
+)
 from rfl_torch.innate import action_bounds
 from rfl_torch.practice import Strategy
 from sims.maze import STEP_LENGTH
@@ -143,9 +150,11 @@ def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[
             ("default, held 10", 1, 10, AgentConfig()),
         ):
             log = record(env, times * config.num_steps, hold, seed)
-            begin = time.perf_counter()
-            agent = Agent(choices, seed).fit(log)
-            yield judge.score(name, agent, [log], time.perf_counter() - begin)
+            agent, row = _learn(judge, name, choices, [log], seed)
+            yield row
+        scattered = gym.wrappers.TimeLimit(Anywhere(env, seed), config.num_steps // 10)
+        logs = record_episodes(scattered, 2 * config.num_steps, 3, seed)
+        yield _learn(judge, "default, held 3, 20 logs", AgentConfig(), logs, seed)[1]
         oracle = know_places(agent, log, seed)
         yield judge.score("oracle map, held 10", oracle, [log], 0.0)
         strategies = get_args(Strategy) if config.strategies else ("frontier",)
@@ -153,6 +162,27 @@ def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[
             yield from _practise(config, judge, env, agent, log, strategy, seed)
         if has_peer and seed < config.seed + config.peer_seeds:
             yield from _run_peer(config, judge, layout, seed)
+
+
+def _learn(
+    judge: "Judge", name: str, choices: AgentConfig, logs: list[Trajectory], seed: int
+) -> tuple[Agent, Row]:
+    begin = time.perf_counter()
+    agent = Agent(choices, seed).fit(logs)
+    return agent, judge.score(name, agent, logs, time.perf_counter() - begin)
+
+
+class Anywhere(gym.Wrapper):
+    """Every episode begins at a random place of the room."""
+
+    def __init__(self, env: gym.Env, seed: int) -> None:
+        super().__init__(env)
+        self._rng = np.random.default_rng([seed, 3])
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin anew."""
+        place = scoring.maze_layout(self.env).random_free_position(self._rng)
+        return self.env.reset(**options | {"options": {MAZE.reset_option: place}})
 
 
 def _practise(
