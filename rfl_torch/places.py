@@ -297,29 +297,37 @@ class KnownPlaces:
         waiting = {
             k: _Waiting(looks[k], shifts[k], self._hold) for k, part in enumerate(parts) if not part
         }
+        log = np.repeat(np.arange(len(looks)), [len(look) for look in looks])
+        seen = csr_array((np.ones(len(log)), (log, np.concatenate(looks))))
+        seen.resize((len(looks), len(self._hold)))
         while waiting:
-            k, start = self._next(waiting)
+            k, start = self._next(waiting, seen)
             del waiting[k]
             parts[k] = self.follow(looks[k], shifts[k], start)
         tracks, nodes = zip(*(part for part in parts if part), strict=True)
         return list(tracks), list(nodes)
 
-    def _next(self, waiting: dict[int, "_Waiting"]) -> tuple[int, Array]:
+    def _next(self, waiting: dict[int, "_Waiting"], seen: csr_array) -> tuple[int, Array]:
         """Of the logs that wait, the one that agrees in most steps with what is known; its start.
 
         The first that agrees in most of what it might is as good.
+
+        Args:
+            waiting: by their numbers.
+            seen: how often each log saw each look.
         """
         first = next(iter(waiting))
         if not self.look:
             return first, np.zeros(self._hold.shape[1])
         num_places = np.array([len(own) for own in self._of_look])
-        might = {k: int(log.num_seen[num_places > 0].sum()) for k, log in waiting.items()}
-        order = sorted((k for k in waiting if might[k]), key=lambda k: -might[k])
+        might, num_known = seen @ (num_places > 0), seen.sign() @ num_places
+        numbers = np.array(list(waiting))
+        numbers = numbers[might[numbers] > 0]
         best = None
-        for k in order:
-            log, num_known = waiting[k], int(num_places[waiting[k].num_seen > 0].sum())
-            if log.num_known != num_known:
-                log.num_known = num_known
+        for k in numbers[might[numbers].argsort(kind="stable")[::-1]].tolist():
+            log = waiting[k]
+            if log.num_known != num_known[k]:
+                log.num_known = num_known[k]
                 log.start, log.agreement = self.find_start(log.places)
             if best is None or log.agreement > waiting[best].agreement:
                 best = k
@@ -373,9 +381,8 @@ class _Waiting:
 
     def __init__(self, look: Labels, shift: Array, hold: Array) -> None:
         self._log = look, shift, hold
-        self.num_seen = np.bincount(look, minlength=len(hold))
         self.length = float(np.abs(shift).sum())
-        self.num_known = 0  # places of its looks when it was asked last
+        self.num_known = 0.0  # places of its looks when it was asked last
         self.start, self.agreement = np.zeros(hold.shape[1]), -np.inf
 
     @cached_property
