@@ -294,9 +294,9 @@ class BeliefExecutor:
             self.status = "gave_up"
             self.reason = f"no way is known from here, nor found in {LONGEST_SEARCH} steps"
             return self._agent.rest_action
-        if self._explorer is None or self._cut_off == 1:
-            self._explorer = self._agent.explorer(self._seed, self.node)
-        if self._cut_off == CONFIRMED and self._agent.positions is not None:
+        if self._explorer is None:
+            self._explorer = self._agent.explorer(self._seed)
+        if self._cut_off in (1, CONFIRMED) and self._agent.positions is not None:
             self._explorer.know(self._agent.positions - self._agent.positions[self.node])
         return self._explore(self._explorer)
 
