@@ -192,6 +192,15 @@ def test_logs_are_laid_on_one_another_in_any_order():
     assert len(known.look) == 230
 
 
+def test_a_log_that_crosses_another_is_laid_on_it():
+    """They share one look; what the other saw right beside it is not strange there."""
+    looks = [np.arange(60), np.concatenate([np.arange(60, 90), [30], np.arange(90, 120)])]
+    shifts = [np.tile(step, (59 + log, 1)) for log, step in enumerate(([1.0, 0.0], [0.0, 1.0]))]
+    tracks, _ = places.KnownPlaces(np.ones((120, 2))).follow_all(looks, shifts, [None] * 2)
+    np.testing.assert_allclose(tracks[1][30], tracks[0][30], atol=places.PULL)
+    assert np.abs(np.concatenate(tracks)).max() < 60
+
+
 def test_a_log_that_fits_nowhere_is_out_of_reach():
     """Its only known look is where most of it is strange, or it has none."""
     known = places.KnownPlaces(np.ones((90, 1)))
