@@ -78,6 +78,9 @@ MOST_DIMENSIONS = 3
 MOST_ROUNDS = 8
 """Times that a repaired map is counted and its logs recognised anew, until all nodes are used."""
 
+RARE = 0.02
+"""Share of more data that may read below or above the range that counts as [0, 1]: outliers."""
+
 MIN_STEPS = 10
 """Shortest log that is accepted: the coarsest stage still needs a few steps."""
 
@@ -102,6 +105,12 @@ class Agent:
     """What the logs say of each node, if the map was rebuilt by looks and places."""
     statistics: Statistics | None
     """What the logs say of each node of a grid, if it was not."""
+    observation_low: NDArray[np.float64]
+    """Of the readings, what counts as 0, (D,)."""
+    observation_scale: NDArray[np.float64]
+    """And how much more counts as 1, (D,); 0 for those that are left out."""
+    observation_period: NDArray[np.float64]
+    """Of those found to wrap, counted in that scale; 0 for the others, (D,)."""
     look_radius: float
     """Mean absolute difference of normalised observations within which places look the same."""
     samples: Triplets
@@ -236,9 +245,11 @@ class Agent:
         is still there keeps its number. A log that begins with the very observation that the last
         one ended with goes on from it. Executors made before are of the old map: make new ones.
 
-        Where actions add up to positions, the logs are kept and laid out anew together. What was
-        learned from and is shown often enough by later steps is left out, beyond 10,000 steps and
-        30 a node: time and memory grow with the map, about 0.1 ms and 110 bytes for each step kept.
+        Where actions add up to positions, the logs are kept and laid out anew together, and the
+        range that readings are normalised by becomes wide enough for them, but for outliers. What
+        was learned from and is shown often enough by later steps is left out, beyond 10,000 steps
+        and 30 a node: time and memory grow with the map, about 0.1 ms (0.5 with thousands of nodes)
+        and 110 bytes for each step kept.
 
         Raises:
             ValueError: if a log has other readings or actions than those learned from, or takes
@@ -310,6 +321,7 @@ class Agent:
             (filled,) = self._filled([observations], [path])
             more = join([(path.numpy(), filled, self.unit_actions(log.actions))])
             memory = memory.plus(more, goes_on)
+        memory = self._widen(memory, len(known))
         seen, actions = memory.logs()
         track = self._follow_track(seen, actions, known[: memory.settled])
         positions = track.positions()
@@ -327,6 +339,33 @@ class Agent:
         self._train_bank(self.samples)
         self.memory = self.memory.thinned()
         return self.memory.node
+
+    def _widen(self, memory: Memory, num_known: int) -> Memory:
+        """Let the range that counts as [0, 1] hold what is read now, too; returns the memory in it.
+
+        A reading that hardly changed in the first log would outweigh all others where it changes:
+        looks would be as short as a step there, and logs that cross have none in common.
+
+        Args:
+            memory: all logs, normalised as before.
+            num_known: steps of it that are not new.
+        """
+        fresh = memory.observation[num_known:].astype(np.float64)
+        if not len(fresh) or self.observation_period.any():
+            return memory
+        low, high = np.quantile(fresh, (RARE, 1.0 - RARE), axis=0)
+        low, high = low.clip(max=0.0), high.clip(min=1.0)
+        if not low.any() and (high == 1.0).all():
+            return memory
+        used = self.observation_scale > 0
+        begin, scale = self.observation_low.copy(), self.observation_scale.copy()
+        begin[used] += low * scale[used]
+        scale[used] *= high - low
+        self.observation_low, self.observation_scale = begin, scale
+        observation = ((memory.observation - low) / (high - low)).astype(np.float32)
+        memory = memory._replace(observation=observation)
+        self.look_radius = look_radius(*memory.logs())
+        return memory
 
     def _grow(self, logs: list[Trajectory]) -> NDArray[np.int64]:
         """Take logs into the map one by one; returns the path of the last one."""

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 LEAST_STEPS, STEPS_A_NODE = 10_000, 30
 """Steps that are kept whatever they show, in all and for each node: 10,000 are laid out in half a
@@ -19,6 +20,13 @@ ENOUGH = 10
 
 PIECE = 25
 """Steps that are left out together. Where the robot then was is known from the nodes around."""
+
+SAME = 3e-6
+"""Distance of normalised observations that are one and the same: what is kept was rounded again
+whenever more data made the range wider that they are normalised by."""
+
+FAR = 1e30
+"""What a missing reading is taken for where the same is sought: nothing is as far."""
 
 
 class Memory(NamedTuple):
@@ -55,21 +63,22 @@ class Memory(NamedTuple):
 
         Of the steps that saw the very same, the one is meant that goes on from the last.
         """
-        steps: dict[bytes, list[int]] = {}
-        for step, seen in enumerate(self.observation):
-            steps.setdefault(seen.tobytes(), []).append(step)
-        remembered, step = path.copy(), -2
-        for t, seen in enumerate(observations.astype(np.float32)):
-            same = steps.get(seen.tobytes())
-            step = -2 if same is None else step + 1 if step + 1 in same else same[0]
-            if same is not None:
-                remembered[t] = self.node[step]
+        seen, number = np.unique(self.observation, axis=0, return_inverse=True)
+        number = number.ravel()
+        steps = np.split(number.argsort(kind="stable"), np.bincount(number).cumsum()[:-1])
+        sought = np.nan_to_num(observations.astype(np.float32), nan=FAR)
+        tree, remembered, step = cKDTree(seen), path.copy(), -2
+        _, nearest = tree.query(sought, distance_upper_bound=SAME)
+        for t, same in enumerate(tree.query_ball_point(sought, SAME)):
+            goes_on = any(step + 1 in steps[row] for row in same)
+            step = step + 1 if goes_on else steps[nearest[t]][0] if same else -2
+            remembered[t] = self.node[step] if same else path[t]
         return remembered
 
     def ends_with(self, observation: NDArray[np.float64]) -> bool:
         """Whether the readings (E,) that are there are those of the last step."""
         is_there = ~np.isnan(observation)
-        is_same = observation.astype(np.float32) == self.observation[-1]
+        is_same = np.abs(observation - self.observation[-1]) <= SAME
         return bool(is_there.any() and is_same[is_there].all())
 
     def thinned(self) -> "Memory":

@@ -497,6 +497,17 @@ def part(log, begin, end):
     return Trajectory(log.observations[begin : end + 1], log.actions[begin:end], *bounds, truth)
 
 
+def pieces(log, is_in):
+    """Parts of a log of more than 50 steps that begin, stay and end where the mask (T+1,) holds."""
+    cuts = np.flatnonzero(np.diff(is_in)) + 1
+    begins, ends = np.append(0, cuts), np.append(cuts, len(is_in)) - 1
+    return [
+        part(log, begin, end)
+        for begin, end in zip(begins, ends, strict=True)
+        if is_in[begin] and end - begin > 50
+    ]
+
+
 def test_a_room_entered_later_is_not_taken_for_one_that_looks_the_same(late, half_path):
     """The rest of the walk comes in pieces of 500 steps, most of which begin inside a bay."""
     (walk, step), agent = late, Agent.load(half_path)
@@ -710,6 +721,33 @@ def test_a_robot_is_done_exploring_where_what_it_sees_is_plainly_the_maps(left_h
     assert executor._explorer is None
 
 
+def test_more_data_is_seen_as_if_it_had_been_there_from_the_first(tmp_path):
+    """Logs of a corridor, then of the hall beside it, where the ways are eight times as long."""
+    plan, layout = {"size": [500, 400], "walls": [[0, 100, 300, 100]]}, tmp_path / "hall.json"
+    layout.write_text(json.dumps(plan | {"start": [60, 50]}))
+    with gym.make("rfl/RangefinderMaze-v0", layout=str(layout)) as env:
+        walk = record(env, 9000, hold=3, seed=1)
+    is_inside = (walk.ground_truth < (260, 100)).all(1)
+    corridor, hall = pieces(walk, is_inside), pieces(walk, ~is_inside)
+    agent, whole = Agent(SMALL).fit(corridor), Agent(SMALL).fit(corridor + hall)
+    agent.partial_fit(hall)
+    assert agent.has_track
+    assert agent.num_nodes < 1.1 * whole.num_nodes  # 1.35 times, if ranges stay the corridor's
+    normal = agent.normalize(np.concatenate([log.observations for log in hall]))
+    assert np.quantile(normal, [0.02, 0.98]) == pytest.approx([0.0, 1.0], abs=0.3)
+    (found,) = (agent.recognize(log.observations) for log in hall[-1:])
+    np.testing.assert_array_equal(found, agent.memory.paths()[-1])
+
+
+def test_outliers_in_more_data_do_not_change_what_all_else_looks_like(late, half_path):
+    (walk, step), agent = late, Agent.load(half_path)
+    scale = agent.observation_scale
+    log = copy.deepcopy(walk.log)
+    log.observations[step::60] *= 100.0
+    agent.partial_fit(part(log, step, step + 1000))
+    assert (agent.observation_scale < 1.5 * scale).all()  # what was truly read is 1.42 times wider
+
+
 def test_a_robot_in_a_part_of_the_map_from_which_no_way_is_known_finds_one(tmp_path):
     """Logs of two rooms, none of which saw the door between them."""
     plan, layout = {"size": [500, 240], "walls": [[250, 0, 250, 130]]}, tmp_path / "rooms.json"
@@ -717,13 +755,7 @@ def test_a_robot_in_a_part_of_the_map_from_which_no_way_is_known_finds_one(tmp_p
     with gym.make("rfl/RangefinderMaze-v0", layout=str(layout)) as env:
         walk = record(env, 8000, hold=3, seed=0)
     room = np.sign(walk.ground_truth[:, 0] - 250) * (np.abs(walk.ground_truth[:, 0] - 250) > 70)
-    cuts = np.flatnonzero(np.diff(room)) + 1
-    begins, ends = np.append(0, cuts), np.append(cuts, len(room)) - 1
-    logs = [
-        part(walk, begin, end)
-        for begin, end in zip(begins, ends, strict=True)
-        if room[begin] and end - begin > 50
-    ]
+    logs = pieces(walk, room < 0) + pieces(walk, room > 0)
     agent = Agent(SMALL).fit(logs)
     num_parts, piece = connected_components(agent.graph, connection="strong")
     assert num_parts == 2
