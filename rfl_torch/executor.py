@@ -281,10 +281,8 @@ class BeliefExecutor:
         """Look for what is known."""
         if self._agent.free_ways is None:
             return self._search.act(normal)
-        if self._explorer is None:
-            self._explorer = self._agent.explorer(self._seed)
         self._is_exploring = True
-        return self._explore(self._explorer)
+        return self._explore()
 
     def _look_for_a_way(self) -> NDArray[np.float32]:
         """Explore on from a part of the map from which none is known, until another is proved."""
@@ -294,15 +292,19 @@ class BeliefExecutor:
             self.status = "gave_up"
             self.reason = f"no way is known from here, nor found in {LONGEST_SEARCH} steps"
             return self._agent.rest_action
+        positions = self._agent.positions
+        if positions is None or self._cut_off not in (1, CONFIRMED):
+            return self._explore()
+        return self._explore(positions - positions[self.node])
+
+    def _explore(self, known: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
+        """Go to where nothing was seen yet; places (N, A), counted from here, are known."""
         if self._explorer is None:
             self._explorer = self._agent.explorer(self._seed)
-        if self._cut_off in (1, CONFIRMED) and self._agent.positions is not None:
-            self._explorer.know(self._agent.positions - self._agent.positions[self.node])
-        return self._explore(self._explorer)
-
-    def _explore(self, explorer: Explorer) -> NDArray[np.float32]:
+        if known is not None:
+            self._explorer.know(known)
         self._is_led = True
-        return explorer.act(self._sensors.working(self._sensed))
+        return self._explorer.act(self._sensors.working(self._sensed))
 
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar, not after many strange ones, and a jump was proved."""
