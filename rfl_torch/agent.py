@@ -783,10 +783,12 @@ class Agent:
         What the map was laid out from is where the track has it.
         """
         normal = self.normalize(observations)
-        path = inference.most_likely_path(self._uniform_chain, normal)
+        known = np.full(len(normal), -1)
         if self.memory is not None and self.has_track:
-            path = self.memory.remember(normal, path)
-        return path
+            known = self.memory.remember(normal)
+        if (known >= 0).all():
+            return known
+        return np.where(known >= 0, known, inference.most_likely_path(self._uniform_chain, normal))
 
     def executor(self, goal: Goal, seed: int = 0) -> Executor:
         """Make the object that drives to `goal`.

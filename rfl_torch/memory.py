@@ -56,10 +56,8 @@ class Memory(NamedTuple):
         """Nodes (T+1,) of each log."""
         return np.split(self.node, self.start[1:])
 
-    def remember(
-        self, observations: NDArray[np.float64], path: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
-        """A path (T,) with what is remembered in place of what was made of the observations (T, E).
+    def remember(self, observations: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Nodes (T,) where observations (T, E) were kept, -1 for what was not.
 
         Of the steps that saw the very same, the one is meant that goes on from the last.
         """
@@ -67,12 +65,12 @@ class Memory(NamedTuple):
         number = number.ravel()
         steps = np.split(number.argsort(kind="stable"), np.bincount(number).cumsum()[:-1])
         sought = np.nan_to_num(observations.astype(np.float32), nan=FAR)
-        tree, remembered, step = cKDTree(seen), path.copy(), -2
+        tree, remembered, step = cKDTree(seen), np.full(len(sought), -1), -2
         _, nearest = tree.query(sought, distance_upper_bound=SAME)
         for t, same in enumerate(tree.query_ball_point(sought, SAME)):
             goes_on = any(step + 1 in steps[row] for row in same)
             step = step + 1 if goes_on else steps[nearest[t]][0] if same else -2
-            remembered[t] = self.node[step] if same else path[t]
+            remembered[t] = self.node[step] if same else -1
         return remembered
 
     def ends_with(self, observation: NDArray[np.float64]) -> bool:

@@ -94,8 +94,8 @@ def test_what_is_remembered_goes_on_from_what_was_seen_last():
     seen = np.array([[0.1], [0.2], [0.1], [0.3]])
     action = np.zeros((3, 1), np.float32)
     memory = join([(np.array([0, 1, 2, 3]), seen, action)])
-    path = memory.remember(np.array([[0.2], [0.1], [0.9], [0.1]]), np.full(4, 7))
-    assert path.tolist() == [1, 2, 7, 0]
+    path = memory.remember(np.array([[0.2], [0.1], [0.9], [0.1]]))
+    assert path.tolist() == [1, 2, -1, 0]
 
 
 def test_what_is_remembered_may_have_been_rounded_again():
@@ -106,7 +106,7 @@ def test_what_is_remembered_may_have_been_rounded_again():
     assert (wider.observation != rounded).any()
     sought = np.where(np.arange(51)[:, None] % 2, rounded, rounded + 1e-3)
     sought[4] = np.nan
-    path = wider.remember(sought, np.full(51, -1))
+    path = wider.remember(sought)
     np.testing.assert_array_equal(path, np.where(np.arange(51) % 2, node, -1))
     assert wider.ends_with(rounded[-1])
 
@@ -115,5 +115,5 @@ def test_of_what_differs_by_rounding_alone_what_goes_on_is_remembered():
     """Along a hall, all that is seen is the same but for the last bits."""
     hall = 0.5 + 1e-7 * np.array([0.0, 3.0, 1.0, 2.0])[:, None]
     memory = join([(np.arange(5), np.concatenate([[[0.1]], hall]), np.zeros((4, 1), np.float32))])
-    path = memory.remember(np.array([[0.1], [0.5], [0.5], [0.5], [0.5]]), np.full(5, -1))
+    path = memory.remember(np.array([[0.1], [0.5], [0.5], [0.5], [0.5]]))
     assert path.tolist() == [0, 1, 2, 3, 4]
