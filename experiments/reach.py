@@ -14,6 +14,7 @@ import copy
 import importlib.util
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +52,10 @@ millimetres between the places that are compared."""
 PEER_NEAR = 0.03
 """Mean absolute difference of ranges within which the peer's goal counts as reached in training:
 about a full step."""
+
+
+LEARN_TASKS = 5
+"""Tasks between two updates of an agent that learns from what it did in them."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +157,8 @@ def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[
             log = record(env, times * config.num_steps, hold, seed)
             agent, row = _learn(judge, name, choices, [log], seed)
             yield row
+            if hold == 3:
+                yield from judge.score_on_the_way(f"{name}, learning from tasks", agent, log)
         scattered = gym.wrappers.TimeLimit(Anywhere(env, seed), config.num_steps // 10)
         logs = record_episodes(scattered, 2 * config.num_steps, 3, seed)
         yield _learn(judge, "default, held 3, 20 logs", AgentConfig(), logs, seed)[1]
@@ -201,34 +208,37 @@ def _practise(
         begin = time.perf_counter()
         agent.practice(watched, config.practice // 4, seed=4 * seed + part, strategy=strategy)
         seconds += time.perf_counter() - begin
-        logs.append(watched.take(log))
+        logs.append(watched.take())
         yield judge.score(f"practice: {strategy}", agent, logs, seconds)
 
 
 class Watched(gym.Wrapper):
-    """Keeps the ground truth of what was seen, for the judge."""
+    """Keeps what was seen and done, with the ground truth for the judge."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self._seen: list[tuple[Any, Any]] = []
+        self._done: list[Any] = []
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Begin anew."""
         observation, info = self.env.reset(**options)
-        self._seen = [(observation, info["ground_truth"])]
+        self._seen, self._done = [(observation, info["ground_truth"])], []
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Go on, and keep what is seen."""
         result = self.env.step(action)
         self._seen.append((result[0], result[4]["ground_truth"]))
+        self._done.append(action)
         return result
 
-    def take(self, like: Trajectory) -> Trajectory:
-        """What was seen since the last reset; its actions are not kept, and are zeros."""
+    def take(self) -> Trajectory:
+        """What was seen and done since the last reset."""
+        bounds = action_bounds(self.action_space)
         observations, truth = (np.stack(part) for part in zip(*self._seen, strict=True))
-        actions = np.zeros((len(observations) - 1, like.actions.shape[1]), np.float32)
-        return Trajectory(observations, actions, *like.bounds, truth)
+        actions = np.reshape(self._done, (-1, len(bounds[0]))).astype(np.float32)
+        return Trajectory(observations, actions, *bounds, truth)
 
 
 def know_places(agent: Agent, log: Trajectory, seed: int) -> Agent:
@@ -261,20 +271,66 @@ class Judge:
         table = scoring.node_table(agent, logs, MAZE)
         rng = np.random.default_rng([self._seed, 2])
         nodes = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
-        truth = scoring.ground_truth(logs)
-        covered = scoring.coverage(scoring.maze_layout(self._env), truth, table)
-        scores = scoring.map_scores(agent, table, MAZE)
         # Nodes first: what goes wrong on the way to a place that no log knows is remembered.
         chained = self._run(agent, nodes, logs[-1].ground_truth)
         anywhere = self._run(agent, scoring.from_anywhere(nodes, self._env, None, rng), None)
+        places = self._run(agent, self.places, None)
+        return self._row(name, agent, logs, seconds, places, chained, anywhere)
+
+    def score_on_the_way(self, name: str, start: Agent, log: Trajectory) -> Iterator[Row]:
+        """Let an agent do the node tasks from anywhere, and learn from what it saw and did there.
+
+        The goals are those of `score`: the nodes that lie where the map's nodes lay before. A row
+        for each half.
+        """
+        agent, logs, watched = copy.deepcopy(start), [log], Watched(self._env)
+        table = scoring.node_table(agent, logs, MAZE)
+        rng = np.random.default_rng([self._seed, 2])
+        tasks = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
+        tasks = scoring.from_anywhere(tasks, self._env, None, rng)
+        seconds, middle = 0.0, len(tasks) // 2
+        for half in (range(middle), range(middle, len(tasks))):
+            done: list[bool] = []
+            for first in half[::LEARN_TASKS]:
+                fresh = []
+                for number in half[first - half.start :][:LEARN_TASKS]:
+                    task = tasks[number]
+                    if start.positions is not None and agent.positions is not None:
+                        away = agent.positions - start.positions[task.goal]
+                        task = task._replace(goal=int(np.linalg.norm(away, axis=1).argmin()))
+                    run = (watched, agent, [task], MAZE, None, self._seed + number)
+                    done += [bool(trial.is_true) for trial in scoring.run_tasks(*run)]
+                    fresh.append(watched.take())
+                begin = time.perf_counter()
+                agent.partial_fit([part for part in fresh if part.num_steps])
+                seconds += time.perf_counter() - begin
+                logs += fresh
+            anywhere, places = _share(done), self._run(agent, self.places, None)
+            yield self._row(name, agent, logs, seconds, places, None, anywhere)
+
+    def _row(
+        self,
+        name: str,
+        agent: Agent,
+        logs: list[Trajectory],
+        seconds: float,
+        places: Share,
+        nodes: Share | None,
+        anywhere: Share,
+    ) -> Row:
+        """With the scores of the map."""
+        table = scoring.node_table(agent, logs, MAZE)
+        layout = scoring.maze_layout(self._env)
+        covered = scoring.coverage(layout, scoring.ground_truth(logs), table)
+        scores = scoring.map_scores(agent, table, MAZE)
         return Row(
             name,
             self._layout,
             self._seed,
             sum(log.num_steps for log in logs),
             seconds,
-            self._run(agent, self.places, None),
-            chained,
+            places,
+            nodes,
             anywhere,
             covered["coverage_nodes"],
             scores["wormhole_share"],
@@ -409,21 +465,24 @@ def _run_peer(config: Reach, judge: Judge, layout: str, seed: int) -> Iterator[R
 
 
 def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
-    """Rows pooled over seeds, one for each layout, contestant and number of steps."""
+    """Rows pooled over seeds, for each layout and contestant, and each time it was scored."""
     header = ["layout", "contestant", "steps", "logs", "node goals", "from anywhere", "place goals"]
     header += ["coverage", "wormholes", "connected", "seconds"]
     groups: dict[tuple[str, str, int], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row.layout, row.name, row.num_steps), []).append(row)
+    seen: Counter[tuple[str, str, int]] = Counter()
+    for row in rows:  # who is scored on the way has several rows of a seed
+        seen[row.layout, row.name, row.seed] += 1
+        number = seen[row.layout, row.name, row.seed]
+        groups.setdefault((row.layout, row.name, number), []).append(row)
     lines = []
-    for (layout, name, steps), group in groups.items():
+    for (layout, name, _), group in groups.items():
         nodes = [row.nodes for row in group if row.nodes is not None]
         anywhere = [row.anywhere for row in group if row.anywhere is not None]
         lines.append(
             [
                 layout,
                 name,
-                str(steps),
+                f"{np.median([row.num_steps for row in group]):.0f}",
                 str(len(group)),
                 str(_pool(nodes)) if nodes else "-",
                 str(_pool(anywhere)) if anywhere else "-",

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from experiments import benchmark, reach
+from rfl_torch import Agent, AgentConfig, Stage, record
 
 
 @pytest.fixture(autouse=True)
@@ -98,3 +99,19 @@ def test_a_sight_tells_a_place_unless_another_looks_the_same(layout, least, most
     with gym.make("rfl/RangefinderMaze-v0", layout=layout) as env:
         row = reach.Judge(env, layout, 0, 20).best_by_sight()
     assert least <= row.places.successes <= most
+
+
+def test_who_learns_from_tasks_knows_more_after_each_half_and_the_contestant_stays_as_it_was():
+    """A log of 2,000 steps knows a part of the room."""
+    stages = (Stage(3, 60, (0.01, 1.0), pseudo_count=0.01, min_scale=0.05, tolerance=0.0),)
+    with gym.make("rfl/RangefinderMaze-v0", layout="paper") as env:
+        log = record(env, 2000, hold=3, seed=0)
+        agent = Agent(AgentConfig(shape=(8, 8), stages=stages)).fit(log)
+        assert agent.has_track
+        judge, num_nodes = reach.Judge(env, "paper", 0, 6), agent.num_nodes
+        before = judge.score("before", agent, [log], 0.0)
+        rows = list(judge.score_on_the_way("learning", agent, log))
+    assert before.coverage + 0.1 < rows[0].coverage <= rows[1].coverage
+    assert 2000 < rows[0].num_steps < rows[1].num_steps
+    assert [row.anywhere.trials for row in rows] == [3, 3]
+    assert agent.num_nodes == num_nodes
