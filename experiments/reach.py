@@ -53,7 +53,6 @@ PEER_NEAR = 0.03
 """Mean absolute difference of ranges within which the peer's goal counts as reached in training:
 about a full step."""
 
-
 LEARN_TASKS = 5
 """Tasks between two updates of an agent that learns from what it did in them."""
 
@@ -269,13 +268,11 @@ class Judge:
     def score(self, name: str, agent: Agent, logs: list[Trajectory], seconds: float) -> Row:
         """Let an agent do the tasks."""
         table = scoring.node_table(agent, logs, MAZE)
-        rng = np.random.default_rng([self._seed, 2])
-        nodes = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
+        nodes, starting_anywhere = self._node_tasks(agent, table)
         # Nodes first: what goes wrong on the way to a place that no log knows is remembered.
         chained = self._run(agent, nodes, logs[-1].ground_truth)
-        anywhere = self._run(agent, scoring.from_anywhere(nodes, self._env, None, rng), None)
-        places = self._run(agent, self.places, None)
-        return self._row(name, agent, logs, seconds, places, chained, anywhere)
+        anywhere = self._run(agent, starting_anywhere, None)
+        return self._row(name, agent, logs, table, seconds, chained, anywhere)
 
     def score_on_the_way(self, name: str, start: Agent, log: Trajectory) -> Iterator[Row]:
         """Let an agent do the node tasks from anywhere, and learn from what it saw and did there.
@@ -284,42 +281,45 @@ class Judge:
         for each half.
         """
         agent, logs, watched = copy.deepcopy(start), [log], Watched(self._env)
-        table = scoring.node_table(agent, logs, MAZE)
+        _, tasks = self._node_tasks(agent, scoring.node_table(agent, logs, MAZE))
+        seconds, fresh, done = 0.0, list[Trajectory](), list[bool]()
+        for number, task in enumerate(tasks):
+            if start.positions is not None and agent.positions is not None:
+                away = agent.positions - start.positions[task.goal]
+                task = task._replace(goal=int(np.linalg.norm(away, axis=1).argmin()))
+            run = (watched, agent, [task], MAZE, None, self._seed + number)
+            done += [bool(trial.is_true) for trial in scoring.run_tasks(*run)]
+            fresh.append(watched.take())
+            is_half = number + 1 in (len(tasks) // 2, len(tasks))
+            if not is_half and len(fresh) < LEARN_TASKS:
+                continue
+            begin = time.perf_counter()
+            agent.partial_fit([part for part in fresh if part.num_steps])
+            seconds += time.perf_counter() - begin
+            logs += fresh
+            fresh = []
+            if is_half:
+                table = scoring.node_table(agent, logs, MAZE)
+                yield self._row(name, agent, logs, table, seconds, None, _share(done))
+                done = []
+
+    def _node_tasks(self, agent: Agent, table: scoring.NodeTable) -> tuple[list[Task], list[Task]]:
+        """Nodes of a map to go to, and the same with a start anywhere in the room for each."""
         rng = np.random.default_rng([self._seed, 2])
-        tasks = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
-        tasks = scoring.from_anywhere(tasks, self._env, None, rng)
-        seconds, middle = 0.0, len(tasks) // 2
-        for half in (range(middle), range(middle, len(tasks))):
-            done: list[bool] = []
-            for first in half[::LEARN_TASKS]:
-                fresh = []
-                for number in half[first - half.start :][:LEARN_TASKS]:
-                    task = tasks[number]
-                    if start.positions is not None and agent.positions is not None:
-                        away = agent.positions - start.positions[task.goal]
-                        task = task._replace(goal=int(np.linalg.norm(away, axis=1).argmin()))
-                    run = (watched, agent, [task], MAZE, None, self._seed + number)
-                    done += [bool(trial.is_true) for trial in scoring.run_tasks(*run)]
-                    fresh.append(watched.take())
-                begin = time.perf_counter()
-                agent.partial_fit([part for part in fresh if part.num_steps])
-                seconds += time.perf_counter() - begin
-                logs += fresh
-            anywhere, places = _share(done), self._run(agent, self.places, None)
-            yield self._row(name, agent, logs, seconds, places, None, anywhere)
+        nodes = scoring.node_tasks(np.arange(agent.num_nodes), table, self._trials, rng)
+        return nodes, scoring.from_anywhere(nodes, self._env, None, rng)
 
     def _row(
         self,
         name: str,
         agent: Agent,
         logs: list[Trajectory],
+        table: scoring.NodeTable,
         seconds: float,
-        places: Share,
         nodes: Share | None,
         anywhere: Share,
     ) -> Row:
-        """With the scores of the map."""
-        table = scoring.node_table(agent, logs, MAZE)
+        """With the scores of the map, and of places."""
         layout = scoring.maze_layout(self._env)
         covered = scoring.coverage(layout, scoring.ground_truth(logs), table)
         scores = scoring.map_scores(agent, table, MAZE)
@@ -329,7 +329,7 @@ class Judge:
             self._seed,
             sum(log.num_steps for log in logs),
             seconds,
-            places,
+            self._run(agent, self.places, None),
             nodes,
             anywhere,
             covered["coverage_nodes"],
