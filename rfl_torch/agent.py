@@ -351,7 +351,9 @@ class Agent:
             num_known: steps of it that are not new.
         """
         fresh = memory.observation[num_known:].astype(np.float64)
-        if not len(fresh) or self.observation_period.any():
+        if (
+            not len(fresh) or self.observation_period.any()
+        ):  # who wraps has two columns, of no range
             return memory
         low, high = np.quantile(fresh, (RARE, 1.0 - RARE), axis=0)
         low, high = low.clip(max=0.0), high.clip(min=1.0)
@@ -421,7 +423,7 @@ class Agent:
         self._prepare_recognition()
         if self.counts is None:
             path = inference.most_likely_path(self._uniform_chain, observations)
-            self.edges = csr_array(self.edges + repair.sum_edges([path], num_nodes))
+            self.edges = csr_array(self.edges + places.sum_edges([path], num_nodes))
         self.tried = np.pad(self.tried, ((0, num_nodes - len(self.tried)), (0, 0)))
         self.tried += repair.count_directions([path], [actions], num_nodes)
         return path
@@ -562,7 +564,7 @@ class Agent:
             if repair.number_anew(nodes)[1] == self.num_nodes:
                 break  # else leave out what the most likely paths leave out
         assert self.counts is not None
-        self.counts = replace(self.counts, edges=repair.sum_edges(nodes, self.num_nodes))
+        self.counts = replace(self.counts, edges=places.sum_edges(nodes, self.num_nodes))
         return [torch.from_numpy(path) for path in nodes]
 
     def _count(
@@ -623,7 +625,7 @@ class Agent:
         A missing reading is taken for the node's own there, as `control` does.
         """
         nodes = [path.numpy() for path in paths]
-        self.edges = repair.sum_edges(nodes, self.num_nodes)
+        self.edges = places.sum_edges(nodes, self.num_nodes)
         self.tried = repair.count_directions(nodes, unit_actions, self.num_nodes)
         own = [
             self._own_log_density(seen, path)

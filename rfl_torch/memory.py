@@ -61,16 +61,20 @@ class Memory(NamedTuple):
 
         Of the steps that saw the very same, the one is meant that goes on from the last.
         """
-        seen, number = np.unique(self.observation, axis=0, return_inverse=True)
+        seen, first, number = np.unique(
+            self.observation, axis=0, return_index=True, return_inverse=True
+        )
         number = number.ravel()
-        steps = np.split(number.argsort(kind="stable"), np.bincount(number).cumsum()[:-1])
         sought = np.nan_to_num(observations.astype(np.float32), nan=FAR)
-        tree, remembered, step = cKDTree(seen), np.full(len(sought), -1), -2
+        tree, remembered, after = cKDTree(seen), np.full(len(sought), -1), len(number)
         _, nearest = tree.query(sought, distance_upper_bound=SAME)
         for t, same in enumerate(tree.query_ball_point(sought, SAME)):
-            goes_on = any(step + 1 in steps[row] for row in same)
-            step = step + 1 if goes_on else steps[nearest[t]][0] if same else -2
-            remembered[t] = self.node[step] if same else -1
+            if not same:
+                after = len(number)
+                continue
+            goes_on = after < len(number) and number[after] in same
+            step = after if goes_on else first[nearest[t]]
+            remembered[t], after = self.node[step], step + 1
         return remembered
 
     def ends_with(self, observation: NDArray[np.float64]) -> bool:

@@ -75,16 +75,8 @@ def _near_nodes(paths: list[Labels]) -> csr_array:
     one of those, all that lies around either place would hang together.
     """
     num_nodes = max(int(path.max()) for path in paths) + 1
-    count = sum_edges(paths, num_nodes)
+    count = places.sum_edges(paths, num_nodes)
     return csr_array(((count + count.T) >= 2).astype(np.float64) + eye_array(num_nodes))
-
-
-def sum_edges(paths: list[Labels], num_nodes: int) -> csr_array:
-    """How often the paths go from one node to another, or stay, (N, N)."""
-    source = np.concatenate([path[:-1] for path in paths])
-    target = np.concatenate([path[1:] for path in paths])
-    ones = np.ones(len(source))
-    return csr_array((ones, (source, target)), shape=(num_nodes, num_nodes))
 
 
 def number_anew(nodes: list[Labels]) -> tuple[list[Labels], int]:
@@ -148,7 +140,7 @@ class Counts:
             (np.ones(len(node)), (node, np.arange(len(node)))), shape=(num_nodes, len(node))
         )
         return cls(
-            sum_edges(nodes, num_nodes),
+            places.sum_edges(nodes, num_nodes),
             member @ is_there.astype(np.float64),
             member @ values,
             member @ values**2,
