@@ -23,6 +23,7 @@ from rfl_torch.agent_layout import check_state
 from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
 from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
 from rfl_torch.config import AgentConfig
+from rfl_torch.contact import Contact, learn_contact
 from rfl_torch.controllers import (
     MLPBank,
     RBFBank,
@@ -129,6 +130,8 @@ class Agent:
     """Follows the robot by its actions, if they add up to positions."""
     free_ways: FreeWays | None
     """What free ways look like, if actions add up to positions."""
+    contact: Contact | None
+    """And blocked ones."""
     least_familiar: float
     """Tempered log-density [nat] under its node that an observation of a known place has."""
 
@@ -141,7 +144,7 @@ class Agent:
         """Know nothing yet."""
         self.record: list[learning.Progress] = []
         self.counts = self.statistics = self.memory = self.last_seen = None
-        self.free_ways = self.positions = None
+        self.free_ways = self.contact = self.positions = None
         self._motion: Motion | None = None
 
     # -- learning ---------------------------------------------------------------------------
@@ -225,7 +228,8 @@ class Agent:
             positions: of every observation, in full actions, (T+1, A) for each log, if actions add
                 up to positions.
         """
-        self.memory = self.free_ways = self.positions = self.last_seen = None
+        self.memory = self.last_seen = None
+        self.free_ways = self.contact = self.positions = None
         observations = [self.normalize(log.observations) for log in logs]
         actions = [self.unit_actions(log.actions) for log in logs]
         paths = [torch.from_numpy(path) for path in self._count(nodes, observations)]
@@ -541,6 +545,7 @@ class Agent:
             return
         self.positions = places.middles(node, positions, self.num_nodes)
         self.free_ways = learn_free_ways(positions, seen, shifts, actions)
+        self.contact = learn_contact(seen, shifts, actions)
 
     def _repair(
         self,
@@ -851,10 +856,12 @@ class Agent:
         Raises:
             ValueError: if actions don't add up to positions, so that it could not tell.
         """
-        if self.free_ways is None or self.positions is None:
+        if self.free_ways is None or self.contact is None or self.positions is None:
             raise ValueError("the logs show no free ways: their actions don't add up to positions.")
         gap = WIDE if node is None else FINE
-        explorer = Explorer(*self.action_bounds, self.look_radius, self.free_ways, seed, gap)
+        explorer = Explorer(
+            *self.action_bounds, self.look_radius, self.free_ways, self.contact, seed, gap
+        )
         if node is not None:
             explorer.know(self.positions - self.positions[node])
         return explorer
@@ -994,6 +1001,9 @@ class Agent:
         if self.memory is not None:
             memory = self.memory._asdict()
             state |= {f"memory.{name}": torch.from_numpy(value) for name, value in memory.items()}
+        if self.contact is not None:
+            state["contact.threshold"] = torch.from_numpy(self.contact.threshold)
+            state["contact.side"] = torch.from_numpy(self.contact.side)
         if self.free_ways is not None and self.positions is not None:
             state["positions"] = torch.from_numpy(self.positions)
             state["free_ways.weight"] = torch.from_numpy(self.free_ways.weight)
@@ -1054,6 +1064,8 @@ class Agent:
         if "free_ways.weight" in state:
             weight, still = state["free_ways.weight"].numpy(), float(state["free_ways.still"])
             self.free_ways, self.positions = FreeWays(weight, still), state["positions"].numpy()
+            own = {name: t.numpy() for name, t in _with_prefix(state, "contact.").items()}
+            self.contact = Contact(**own) if own else Contact.unknown(sizes["A"], sizes["D"])
         self._prepare_recognition()
         self._prepare_planning()
         pairs, factors = state["blame.pair"].tolist(), state["blame.factor"].tolist()

@@ -35,6 +35,12 @@ FREE_WAYS_LAYOUT: Layout = {
     "positions": (torch.float64, "NA"),
 }
 
+CONTACT_LAYOUT: Layout = {
+    "contact.threshold": (torch.float64, "BD"),
+    "contact.side": (torch.float64, "BD"),
+}
+"""Not in files of versions that didn't learn it."""
+
 LAYOUT: Layout = {
     "hmm.successor": (torch.int64, "NK"),
     "hmm.successor_mask": (torch.bool, "NK"),
@@ -103,6 +109,8 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
         layout |= MEMORY_LAYOUT
     if "free_ways.weight" in state:
         layout |= FREE_WAYS_LAYOUT
+        if "contact.side" in state:
+            layout |= CONTACT_LAYOUT
     layout |= BANK_LAYOUTS[config.controller]
     sizes = check_layout(state, layout)
     num_nodes, obs_dim, action_dim = (sizes[letter] for letter in "NDA")
@@ -141,6 +149,8 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
             raise ValueError(f"{name} has a number below zero")
     if "free_ways.weight" in state and sizes["J"] != obs_dim + 1:
         raise ValueError(f"free_ways.weight has {sizes['J']} rows, needs {obs_dim + 1}")
+    if "contact.side" in state and sizes["B"] != 2 * action_dim:
+        raise ValueError(f"contact.side has {sizes['B']} rows, needs {2 * action_dim}")
     if state["look_radius"] == 0:
         raise ValueError("look_radius is 0")
     factor = state["blame.factor"]
@@ -148,7 +158,7 @@ def check_state(state: dict[str, Tensor], config: AgentConfig) -> dict[str, int]
         raise ValueError(f"blame.factor has numbers outside 1 to {BLAME_LIMIT:g}")
     if state["hmm.emission_log_scale"].abs().max() > 100:
         raise ValueError("hmm.emission_log_scale has numbers beyond 100")
-    for name in ("hmm.emission_mean", "free_ways.weight", "positions"):
+    for name in ("hmm.emission_mean", "free_ways.weight", "contact.threshold", "positions"):
         if name in state and state[name].abs().max() > MAX_READING:
             raise ValueError(f"{name} has numbers beyond {MAX_READING:g}")
     if (state["action_low"] > state["action_high"]).any():

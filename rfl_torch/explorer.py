@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from rfl_torch.contact import Contact
 from rfl_torch.free_ways import FreeWays, ways
 from rfl_torch.looks import LOOK_STEPS
 
@@ -88,6 +89,7 @@ class Explorer:
         low, high: bounds of the action space, (A,).
         radius: of a look, see `looks.look_radius`.
         free_ways: what the logs say of free ways.
+        contact: what they say of blocked ones.
         seed: decides where no cell is left.
         gap: cells from all that were entered for a cell to be new, WIDE or FINE.
     """
@@ -98,10 +100,12 @@ class Explorer:
         high: NDArray[np.float32],
         radius: float,
         free_ways: FreeWays,
+        contact: Contact,
         seed: int,
         gap: int = WIDE,
     ) -> None:
-        self._low, self._high, self._free_ways = low, high, free_ways
+        self._low, self._high = low, high
+        self._free_ways, self._contact = free_ways, contact
         self._rng = np.random.default_rng(seed)
         self._ways = ways(len(low))
         self._most_beyond = BEYOND * radius
@@ -168,9 +172,19 @@ class Explorer:
             self._look_around(normal)
 
     def _count(self, normal: Array, did: Array) -> None:
-        """Add a step to the position; take back the last ones if nothing changed by them."""
+        """Add a step to the position, if what was seen before it says so; else if it shows.
+
+        Where that takes several steps, the last ones are taken back if nothing changed by them.
+        """
         axis = int(np.abs(did).argmax())
         towards = (axis, bool(did[axis] > 0))
+        is_blocked = self._contact.is_blocked(2 * axis + towards[1], self._seen)
+        if is_blocked is not None:
+            self._run = None
+            self._take_note(axis, is_blocked)
+            if not is_blocked:
+                self.position = self.position + did
+            return
         if self._run is None or self._run.towards != towards:
             self._run = _Run(towards, self._seen, self.position, 0)
         run = self._run._replace(num_steps=self._run.num_steps + 1)
@@ -179,10 +193,16 @@ class Explorer:
             return
         self._run = None
         share = min(1.0, float(np.abs(self.position - run.position).max()) / self._lag)
-        if np.abs(normal - run.seen).mean() > self._least * share:
+        is_blocked = bool(np.abs(normal - run.seen).mean() <= self._least * share)
+        if is_blocked:
+            self.position = run.position
+        self._take_note(axis, is_blocked)
+
+    def _take_note(self, axis: int, is_blocked: bool) -> None:
+        """A step along a dimension was stopped, or not; twice in a row the next cell is closed."""
+        if not is_blocked:
             self._jammed = -1 if self._jammed == axis else self._jammed
             return
-        self.position = run.position
         if self._jammed == axis and self._path:
             self._bump(_cell(self.position))
         self._jammed = axis

@@ -6,6 +6,8 @@ import pytest
 
 import sims  # noqa: F401  registers the maze
 from rfl_torch import Agent, AgentConfig, record
+from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
+from rfl_torch.contact import Contact
 from rfl_torch.explorer import BLIND, FINE, WIDE, Cells, Explorer
 from rfl_torch.free_ways import LONGEST, FreeWays, ways
 from rfl_torch.places import NEAR, NODE_STEPS, within
@@ -18,6 +20,8 @@ def learned():
         log = record(env, 6000, hold=3, seed=0)
     return log, Agent(AgentConfig(), 0).fit(log)
 
+
+NOTHING_FELT = Contact.unknown(2, 8)
 
 BOUNDS = (np.full(2, -1.0, np.float32), np.ones(2, np.float32))
 
@@ -51,10 +55,10 @@ class Hook:
                     break
 
 
-def explorer(still=0.0, gap=WIDE):
+def explorer(still=0.0, gap=WIDE, feels=NOTHING_FELT):
     sees_all = FreeWays(np.concatenate([LONGEST * np.eye(8), np.zeros((1, 8))]), still)
     radius = 2 * 0.6 / LONGEST  # an action changes six ways of eight
-    return Explorer(*BOUNDS, radius, sees_all, 0, gap)
+    return Explorer(*BOUNDS, radius, sees_all, feels, 0, gap)
 
 
 @pytest.mark.parametrize(("noise", "still"), [(0.0, 0.0), (0.05, 0.01)])
@@ -94,7 +98,7 @@ def test_an_explorer_knows_where_it_is_after_steps_that_another_chose():
 def test_readings_far_beyond_those_of_the_logs_tell_no_free_ways():
     def steps(weight, gain):
         room = Hook((30, 10))
-        search = Explorer(*BOUNDS, 2 * 0.6 / LONGEST, FreeWays(weight, 0.0), 0)
+        search = Explorer(*BOUNDS, 2 * 0.6 / LONGEST, FreeWays(weight, 0.0), NOTHING_FELT, 0)
         for _ in range(40):
             room.do(search.act(gain * room.see()))
         return room.position
@@ -108,7 +112,8 @@ def test_readings_far_beyond_those_of_the_logs_tell_no_free_ways():
 
 def test_an_explorer_that_sees_nothing_of_free_ways_still_enters_new_cells():
     room = Hook((55, 10))
-    search = Explorer(*BOUNDS, 2 * 0.6 / LONGEST, FreeWays(np.zeros((9, 8)), 0.0), 0)
+    blind = FreeWays(np.zeros((9, 8)), 0.0)
+    search = Explorer(*BOUNDS, 2 * 0.6 / LONGEST, blind, NOTHING_FELT, 0)
     entered = set()
     for _ in range(300):
         room.do(search.act(room.see()))
@@ -215,3 +220,21 @@ def test_a_robot_put_where_its_log_never_was_comes_back_to_its_goal(start, most)
             observation, _, _, _, info = env.step(action)
         assert executor.status == "reached"
         assert np.linalg.norm(info["ground_truth"] - log.ground_truth[3000]) < 44
+
+
+def test_what_walls_feel_like_is_kept_in_the_file(tmp_path):
+    _, agent = learned()
+    agent.save(tmp_path / "agent.safetensors")
+    loaded = Agent.load(tmp_path / "agent.safetensors")
+    assert agent.contact.side.any()
+    for own, other in zip(agent.contact, loaded.contact, strict=True):
+        np.testing.assert_array_equal(own, other)
+    config, state = load_checkpoint(tmp_path / "agent.safetensors")
+    short = state | {name: state[name][:-1] for name in ("contact.threshold", "contact.side")}
+    save_checkpoint(tmp_path / "short.safetensors", config, short)
+    with pytest.raises(ValueError, match=r"contact\.side has 3 rows, needs 4"):
+        Agent.load(tmp_path / "short.safetensors")
+    for name in ("contact.threshold", "contact.side"):
+        del state[name]
+    save_checkpoint(tmp_path / "old.safetensors", config, state)
+    assert not Agent.load(tmp_path / "old.safetensors").contact.side.any()
