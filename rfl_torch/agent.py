@@ -131,7 +131,7 @@ class Agent:
     free_ways: FreeWays | None
     """What free ways look like, if actions add up to positions."""
     contact: Contact | None
-    """And blocked ones."""
+    """What blocked ways look like, if actions add up to positions."""
     least_familiar: float
     """Tempered log-density [nat] under its node that an observation of a known place has."""
 

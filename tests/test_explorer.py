@@ -55,10 +55,10 @@ class Hook:
                     break
 
 
-def explorer(still=0.0, gap=WIDE, feels=NOTHING_FELT):
+def explorer(still=0.0, gap=WIDE):
     sees_all = FreeWays(np.concatenate([LONGEST * np.eye(8), np.zeros((1, 8))]), still)
     radius = 2 * 0.6 / LONGEST  # an action changes six ways of eight
-    return Explorer(*BOUNDS, radius, sees_all, feels, 0, gap)
+    return Explorer(*BOUNDS, radius, sees_all, NOTHING_FELT, 0, gap)
 
 
 @pytest.mark.parametrize(("noise", "still"), [(0.0, 0.0), (0.05, 0.01)])
