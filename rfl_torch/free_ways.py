@@ -25,9 +25,6 @@ WIDTH = 1.6
 NUM_SIGHTS = 5000
 """Sights of the logs that are learned from at most."""
 
-BLOCK = 500
-"""Sights whose ways are measured at once, for memory's sake."""
-
 RIDGE = 1e-4
 """Of the fit, a sight."""
 
@@ -83,15 +80,14 @@ def learn_free_ways(
 def _gone_over(position: Array, chosen: NDArray[np.int64]) -> Array:
     """Full actions along each way from the chosen steps (C,) that the track covers, (C, W)."""
     tree, along = cKDTree(position), ways(position.shape[1])
-    reach = np.arange(1, LONGEST + 1)
-    blocks = []
-    for first in range(0, len(chosen), BLOCK):
-        start = position[chosen[first : first + BLOCK]]
-        points = start[:, None, None] + along[:, None] * reach[:, None]
-        away, _ = tree.query(points.reshape(-1, points.shape[-1]), distance_upper_bound=WIDTH)
-        is_off = np.isinf(away).reshape(points.shape[:3])
-        blocks.append(np.where(is_off.any(2), is_off.argmax(2), LONGEST))
-    return np.concatenate(blocks).astype(np.float64)
+    free = np.full((len(chosen), len(along)), float(LONGEST))
+    start, way = (own.ravel() for own in np.indices(free.shape))
+    for reach in range(1, LONGEST + 1):
+        point = position[chosen[start]] + reach * along[way]
+        is_off = np.isinf(tree.query(point, distance_upper_bound=WIDTH)[0])
+        free[start[is_off], way[is_off]] = reach - 1
+        start, way = start[~is_off], way[~is_off]
+    return free
 
 
 def _change_when_stopped(

@@ -473,7 +473,7 @@ def relax(
     solved = np.empty_like(track)
     for axis, own in enumerate(hold.T):
         normal = stiff + place.T @ diags_array(own / PLACE_WIDTH**2) @ place
-        solved[:, axis] = spsolve(normal.tocsc(), right[:, axis])[:num_steps]
+        solved[:, axis] = spsolve(normal.tocsc(), right[:, axis], "MMD_AT_PLUS_A")[:num_steps]
     return np.split(solved, _starts(nodes)[1:])
 
 
@@ -505,9 +505,9 @@ def _gather(looks: list[Labels], tracks: list[Array], most: float) -> list[Label
         if not len(steps):
             continue
         spot, inverse = np.unique(track[steps].round(), axis=0, return_inverse=True)
-        place = np.ones(1, np.int64)
-        if len(spot) > 1:
-            place = fcluster(linkage(pdist(spot), "complete"), most, "distance").astype(np.int64)
+        apart, place = pdist(spot), np.ones(len(spot), np.int64)
+        if apart.max(initial=0.0) > most:
+            place = fcluster(linkage(apart, "complete"), most, "distance").astype(np.int64)
         node[steps] = num_nodes + place[inverse.ravel()] - 1
         num_nodes += int(place.max())
     return np.split(node, _starts(looks)[1:])

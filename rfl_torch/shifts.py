@@ -13,6 +13,7 @@ sight that could be in the way there, and what was asked for counts as done.
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
@@ -127,6 +128,7 @@ def _what_shows(moved: Array, seen: Array, unit: float) -> tuple[Array, Array]:
     return shown, np.abs(seen - moved @ shown).mean(0) + FLOOR * unit
 
 
+@njit(nogil=True, cache=True)
 def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array:
     """The likeliest moves (T, A), each dimension twice with the others as they are.
 
@@ -136,13 +138,21 @@ def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array
         shown: change of the readings for a full action in each dimension, (A, D).
         noise: of each reading, (D,).
     """
-    moved = asked.copy()
-    for axis in list(range(asked.shape[1])) * 2:
-        others = moved.copy()
-        others[:, axis] = 0.0
-        open_ = change - others @ shown
-        could = asked[:, axis, None] * SHARES
-        miss = np.abs(open_[:, None] - could[..., None] * shown[axis]) / noise
-        best = (NATS - EVIDENCE * miss.sum(-1)).argmax(1)
-        moved[:, axis] = could[np.arange(len(could)), best]
+    moved, open_ = asked.copy(), np.empty(len(noise))
+    dim = asked.shape[1]
+    for t in range(len(asked)):
+        for turn in range(2 * dim):
+            axis = turn % dim
+            open_[:] = change[t]
+            for other in range(dim):
+                if other != axis:
+                    open_ -= moved[t, other] * shown[other]
+            most = -np.inf
+            for k in range(len(SHARES)):
+                could = asked[t, axis] * SHARES[k]
+                miss = 0.0
+                for d in range(len(noise)):
+                    miss += abs(open_[d] - could * shown[axis, d]) / noise[d]
+                if NATS[k] - EVIDENCE * miss > most:
+                    most, moved[t, axis] = NATS[k] - EVIDENCE * miss, could
     return moved
