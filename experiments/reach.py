@@ -277,16 +277,17 @@ class Judge:
     def score_on_the_way(self, name: str, start: Agent, log: Trajectory) -> Iterator[Row]:
         """Let an agent do the node tasks from anywhere, and learn from what it saw and did there.
 
-        The goals are those of `score`: the nodes that lie where the map's nodes lay before. A row
-        for each half.
+        The goals are those of `score`: the nodes that truly lie where the map's nodes lay before,
+        whatever their numbers are now. A row for each half.
         """
         agent, logs, watched = copy.deepcopy(start), [log], Watched(self._env)
-        _, tasks = self._node_tasks(agent, scoring.node_table(agent, logs, MAZE))
+        known = scoring.node_table(agent, [log], MAZE)
+        _, tasks = self._node_tasks(agent, known)
         seconds, fresh, done = 0.0, list[Trajectory](), list[bool]()
         for number, task in enumerate(tasks):
-            if start.positions is not None and agent.positions is not None:
-                away = agent.positions - start.positions[task.goal]
-                task = task._replace(goal=int(np.linalg.norm(away, axis=1).argmin()))
+            assert task.target is not None
+            away = np.linalg.norm(known.mean - task.target, axis=1)
+            task = task._replace(goal=int(np.nanargmin(away)))
             run = (watched, agent, [task], MAZE, None, self._seed + number)
             done += [bool(trial.is_true) for trial in scoring.run_tasks(*run)]
             fresh.append(watched.take())
@@ -298,6 +299,7 @@ class Judge:
             seconds += time.perf_counter() - begin
             logs += fresh
             fresh = []
+            known = scoring.node_table(agent, [log], MAZE)
             if is_half:
                 table = scoring.node_table(agent, logs, MAZE)
                 yield self._row(name, agent, logs, table, seconds, None, _share(done))

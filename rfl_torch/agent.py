@@ -245,12 +245,14 @@ class Agent:
     def partial_fit(self, logs: Trajectory | list[Trajectory]) -> "Agent":
         """Learn from more data without starting over.
 
-        What the logs show anew becomes new nodes, what they do anew becomes new edges; a node that
-        is still there keeps its number. A log that begins with the very observation that the last
-        one ended with goes on from it. Executors made before are of the old map: make new ones.
+        What the logs show anew becomes new nodes, what they do anew becomes new edges. A log that
+        begins with the very observation that the last one ended with goes on from it. Executors
+        made before are of the old map: make new ones.
 
         Where actions add up to positions, the logs are kept and laid out anew together, and the
-        range that readings are normalised by becomes wide enough for them, but for outliers. What
+        range that readings are normalised by becomes wide enough for them, but for outliers. A node
+        that is still there keeps its number, but where the range changed, so do nodes. What lay at
+        one of the `positions` lies there still: a goal is the node nearest to where it lay. What
         was learned from and is shown often enough by later steps is left out, beyond 10,000 steps
         and 30 a node: time and memory grow with the map, about 0.1 ms (0.5 with thousands of nodes)
         and 110 bytes for each step kept.
@@ -332,6 +334,9 @@ class Agent:
         nodes = track.split(positions)
         self.memory = memory._replace(node=repair.keep_numbers(np.concatenate(nodes), known))
         self._count(self.memory.paths(), seen)
+        if self.positions is not None:
+            before = self.positions[known]
+            positions = places.keep_origin(positions, before, len(self.memory.paths()[0]))
         self._learn_land(self.memory.node, positions, track.shifts, seen, actions)
         self._prepare_recognition()
         paths = [torch.from_numpy(path) for path in self.memory.paths()]

@@ -477,6 +477,22 @@ def relax(
     return np.split(solved, _starts(nodes)[1:])
 
 
+def keep_origin(positions: list[Array], before: Array, num_first: int) -> list[Array]:
+    """Positions (T+1, A) each, shifted so that what was at a spot is there still.
+
+    By what moves as the first log does: pieces of the map that found their place move otherwise.
+
+    Args:
+        positions: of all steps.
+        before: of the first of these steps, from when they were laid out last, (M, A).
+        num_first: steps of the first log.
+    """
+    moved = np.concatenate(positions)[: len(before)] - before
+    away = np.linalg.norm(moved - np.median(moved[:num_first], axis=0), axis=1)
+    shift = np.median(moved[away < PLACE_STEPS], axis=0)
+    return [own - shift for own in positions]
+
+
 def middles(node: Labels, positions: list[Array], num_nodes: int) -> Array:
     """Mean position of the steps (T,) of each node, (N, A); 0 of one without."""
     position = np.concatenate(positions)

@@ -721,14 +721,20 @@ def test_a_robot_is_done_exploring_where_what_it_sees_is_plainly_the_maps(left_h
     assert executor._explorer is None
 
 
-def test_more_data_is_seen_as_if_it_had_been_there_from_the_first(tmp_path):
-    """Logs of a corridor, then of the hall beside it, where the ways are eight times as long."""
-    plan, layout = {"size": [500, 400], "walls": [[0, 100, 300, 100]]}, tmp_path / "hall.json"
+@pytest.fixture(scope="module")
+def corridor_and_hall(tmp_path_factory):
+    """Logs of a corridor, and of the hall beside it, where the ways are eight times as long."""
+    plan = {"size": [500, 400], "walls": [[0, 100, 300, 100]]}
+    layout = tmp_path_factory.mktemp("places") / "hall.json"
     layout.write_text(json.dumps(plan | {"start": [60, 50]}))
     with gym.make("rfl/RangefinderMaze-v0", layout=str(layout)) as env:
         walk = record(env, 9000, hold=3, seed=1)
     is_inside = (walk.ground_truth < (260, 100)).all(1)
-    corridor, hall = pieces(walk, is_inside), pieces(walk, ~is_inside)
+    return pieces(walk, is_inside), pieces(walk, ~is_inside)
+
+
+def test_more_data_is_seen_as_if_it_had_been_there_from_the_first(corridor_and_hall):
+    corridor, hall = corridor_and_hall
     agent, whole = Agent(SMALL).fit(corridor), Agent(SMALL).fit(corridor + hall)
     agent.partial_fit(hall)
     assert agent.has_track
@@ -737,6 +743,28 @@ def test_more_data_is_seen_as_if_it_had_been_there_from_the_first(tmp_path):
     assert np.quantile(normal, [0.02, 0.98]) == pytest.approx([0.0, 1.0], abs=0.3)
     found = agent.recognize(hall[-1].observations)
     np.testing.assert_array_equal(found, agent.memory.paths()[-1])
+
+
+def test_what_was_at_a_spot_is_there_still_when_more_is_learned(corridor_and_hall):
+    """To 0.7 actions after five pieces of the hall, which are out of reach until they fit."""
+    corridor, hall = corridor_and_hall
+    agent = Agent(SMALL).fit(corridor)
+    before = agent.positions[agent.memory.node]
+    for piece in hall[:5]:
+        agent.partial_fit(piece)
+    after = agent.positions[agent.memory.node[: len(before)]]
+    assert np.abs(np.median(after - before, axis=0)).max() < 0.7  # 1.1, if nothing is held
+
+
+def test_the_origin_is_held_by_what_moves_as_the_first_log_does():
+    """Not by the more steps of pieces that found their place, nor by new ones; to 0.1 actions."""
+    rng = np.random.default_rng(0)
+    before = rng.uniform(0, 40, (300, 2))
+    positions = rng.normal(before, 0.3) + np.array([1.5, -2.0])
+    positions[100:300] += 2000.0
+    kept = np.concatenate(places.keep_origin(np.split(positions, [60, 200]), before[:280], 60))
+    assert np.median(kept[:100] - before[:100], axis=0) == pytest.approx([0.0, 0.0], abs=0.1)
+    assert np.ptp(kept - positions, axis=0) == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_outliers_in_more_data_do_not_change_what_all_else_looks_like(late, half_path):
