@@ -27,7 +27,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
-from rfl_torch.looks import LOOK_STEPS
+from rfl_torch.looks import LOOK_RADII, LOOK_STEPS
 from rfl_torch.planner import look_alikes
 from rfl_torch.shifts import find_shifts
 
@@ -177,7 +177,7 @@ def follow_track(
     shifts, misfit, shown, grip = find_shifts(looks, observations, unit_actions, radius)
     errors = [SHIFT_ERROR * np.clip((own / USUAL) ** 2, 1.0, LARGEST) for own in misfit]
     hold = np.clip((grip / PLAIN) ** 2, LEAST_HOLD, 1.0)
-    come_to = KnownPlaces(hold)
+    come_to = KnownPlaces(hold, _much_alike(looks, observations, radius))
     starts: list[Array | None] = [None] * len(looks)
     if known is not None and len(known):
         starts = find_known_starts(known, shifts, errors)
@@ -193,12 +193,13 @@ class KnownPlaces:
 
     Args:
         hold: how much each look holds the track along each dimension, (L, A), 1 where moves show.
+        alike: looks that may be seen at one place, bool (L, L); only each itself if None.
     """
 
-    def __init__(self, hold: Array) -> None:
+    def __init__(self, hold: Array, alike: csr_array | None = None) -> None:
         num_looks, dim = hold.shape
         self._hold = hold
-        self._beside = csr_array(eye_array(num_looks))
+        self._beside = csr_array(eye_array(num_looks)) if alike is None else alike
         self.look: list[int] = []
         self._of_look: list[list[int]] = [[] for _ in range(num_looks)]
         self._sum = np.zeros((64, dim))
@@ -302,7 +303,7 @@ class KnownPlaces:
         log = np.repeat(np.arange(len(looks)), [len(look) for look in looks])
         seen = csr_array((np.ones(len(log)), (log, np.concatenate(looks))))
         seen.resize((len(looks), len(self._hold)))
-        self._beside = within(sum_edges(looks, len(self._hold)), 1)
+        self._beside = csr_array(self._beside + within(sum_edges(looks, len(self._hold)), 1) > 0)
         while waiting:
             k, start = self._next(waiting, seen)
             del waiting[k]
@@ -367,9 +368,9 @@ class KnownPlaces:
     def _agreement(self, other: "KnownPlaces", start: Array) -> float:
         """Steps of another track, begun at `start`, that saw what is known to be seen there.
 
-        Less those, STRANGE times, that saw what was never seen near, nor anything beside that,
-        where others were: in one of several rooms that look alike, most of what a robot sees fits
-        the wrong one, too. But where two tracks cross, each saw few of the looks that are there.
+        Less those, STRANGE times, that saw what was never seen near, nor anything like or beside
+        that, where others were: in one of several rooms that look alike, most of what a robot sees
+        fits the wrong one, too. But where two tracks cross, each saw few of the looks there.
         """
         position, steps = other.position + start, other._count[: len(other.look)]
         tree, look = cKDTree(self.position), np.array(self.look)
@@ -382,6 +383,17 @@ class KnownPlaces:
         fits[step[self._beside[own, there] > 0]] = True
         strange = ~fits & (away < LOOK_STEPS)
         return float(steps[known].sum() - STRANGE * steps[strange].sum())
+
+
+def _much_alike(looks: list[Labels], observations: list[Array], radius: float) -> csr_array:
+    """Looks whose mean sights are within LOOK_RADII of each other, bool (L, L)."""
+    look = np.concatenate(looks)
+    num_looks = int(look.max()) + 1
+    mean = middles(look, observations, num_looks)
+    most = LOOK_RADII * radius * mean.shape[1]
+    i, j = cKDTree(mean).query_pairs(most, p=1, output_type="ndarray").T
+    alike = csr_array((np.ones(len(i), bool), (i, j)), shape=(num_looks, num_looks))
+    return csr_array(alike + alike.T + eye_array(num_looks) > 0)
 
 
 class _Waiting:
@@ -494,7 +506,7 @@ def keep_origin(positions: list[Array], before: Array, num_first: int) -> list[A
 
 
 def middles(node: Labels, positions: list[Array], num_nodes: int) -> Array:
-    """Mean position of the steps (T,) of each node, (N, A); 0 of one without."""
+    """Mean position (or sight) of the steps (T,) of each node, (N, A); 0 of one without."""
     position = np.concatenate(positions)
     total = np.zeros((num_nodes, position.shape[1]))
     np.add.at(total, node, position)

@@ -25,6 +25,10 @@ Labels = NDArray[np.int64]
 NEAREST = 300
 """Steps around a look that show which change of the readings goes with which move."""
 
+OTHERS = 0.5
+"""Weight of the steps there at other looks. Halfway along a hall few steps are told apart, and the
+nearest others are where its ends are in sight: there moves along it show."""
+
 FINE = 0.1
 """Steps at which the same was seen, to this share of a full action's usual change, count once: a
 robot that is pressed against a wall for long would hide what shows when it comes off it."""
@@ -99,13 +103,16 @@ def find_shifts(
         if not len(steps):
             continue
         away = cdist(np.median(middle[steps], 0)[None], told_apart, "cityblock")[0]
-        near = told[away.argpartition(min(NEAREST, len(away)) - 1)[:NEAREST]]
+        is_own = look[told] == own
+        is_near = is_own.copy()
+        is_near[away.argpartition(min(NEAREST, len(away)) - 1)[:NEAREST]] = True
+        near, weight = told[is_near], np.where(is_own[is_near], 1.0, OTHERS)
         asked, seen = action[near], change[near]
-        gain = _ridge(seen, asked, RIDGE * max(float((seen**2).sum()), 1e-12))
+        gain = _ridge(seen, asked, weight, RIDGE * max(float((weight @ seen**2).sum()), 1e-12))
         measured[steps] = change[steps] @ gain
         moved = np.where((seen @ gain) * asked > 0.5 * asked**2, asked, 0.0)
-        moved = _likeliest(seen, asked, *_what_shows(moved, seen, unit))
-        shown, noise = _what_shows(moved, seen, unit)
+        moved = _likeliest(seen, asked, *_what_shows(moved, seen, weight, unit))
+        shown, noise = _what_shows(moved, seen, weight, unit)
         shift[steps] = _likeliest(change[steps], action[steps], shown, noise)
         misfit[steps] = (np.abs(change[steps] - shift[steps] @ shown) / noise).mean(1)
         grip[own] = np.minimum(1.0, np.abs(shown).mean(1) / unit)
@@ -116,16 +123,18 @@ def find_shifts(
     return Shifts(np.split(shift, ends), np.split(misfit, ends), share, grip)
 
 
-def _ridge(inputs: Array, outputs: Array, penalty: float) -> Array:
-    """Weights (I, O) of a ridge regression without a constant."""
-    gram = inputs.T @ inputs + penalty * np.eye(inputs.shape[1])
-    return np.asarray(np.linalg.solve(gram, inputs.T @ outputs))
+def _ridge(inputs: Array, outputs: Array, weight: Array, penalty: float) -> Array:
+    """Weights (I, O) of a ridge regression without a constant, on rows that count so much, (T,)."""
+    weighted = inputs.T * weight
+    gram = weighted @ inputs + penalty * np.eye(inputs.shape[1])
+    return np.asarray(np.linalg.solve(gram, weighted @ outputs))
 
 
-def _what_shows(moved: Array, seen: Array, unit: float) -> tuple[Array, Array]:
+def _what_shows(moved: Array, seen: Array, weight: Array, unit: float) -> tuple[Array, Array]:
     """Change of the readings for a full action in each dimension, (A, D), and their noise, (D,)."""
-    shown = _ridge(moved, seen, MOVE_RIDGE * len(moved))
-    return shown, np.abs(seen - moved @ shown).mean(0) + FLOOR * unit
+    shown = _ridge(moved, seen, weight, MOVE_RIDGE * float(weight.sum()))
+    noise = np.average(np.abs(seen - moved @ shown), axis=0, weights=weight)
+    return shown, noise + FLOOR * unit
 
 
 @njit(nogil=True, cache=True)

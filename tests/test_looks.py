@@ -1,7 +1,9 @@
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from rfl_torch import looks
+import sims  # noqa: F401
+from rfl_torch import looks, record
 
 
 def test_a_look_is_as_wide_as_its_steps_are_far():
@@ -73,3 +75,18 @@ def test_a_look_is_as_wide_where_the_robot_stands_still_for_most_of_the_log():
     seen = 0.01 * np.concatenate([[0.0], move.cumsum()])[:, None] * np.ones((1, 6))
     radius = looks.look_radius([seen], [action])
     assert radius == pytest.approx(0.01 * looks.LOOK_STEPS, rel=0.15)
+
+
+def test_few_looks_are_long_where_an_action_counts_for_much():
+    """In `hall`, held 10, it is 1.8 and one ray tells how far along: a reach is 4.6 actions."""
+    with gym.make("rfl/RangefinderMaze-v0", layout="hall") as env:
+        log = record(env, 8000, hold=10, seed=2)
+    seen = log.observations.astype(np.float64)
+    action = (log.actions + 1) / 2
+    (look,) = looks.find_looks([seen], [action], looks.look_radius([seen], [action]))
+    length = np.zeros(len(look))
+    for own in np.unique(look):
+        (steps,) = np.nonzero(look == own)
+        runs = np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1)
+        length[steps] = max(np.ptp(log.ground_truth[run], axis=0).max() for run in runs)
+    assert (length > 60).mean() < 0.1  # 0.15, if one ray counts for four actions at most

@@ -74,3 +74,20 @@ def test_what_no_reading_shows_counts_as_done():
     assert 0.4 < share < 0.6
     assert grip[:, 0].min() > 0.7
     assert grip[:, 1].max() < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_shows_at_other_looks_alone_counts_as_done(seed):
+    """Its end is in sight from the first half of a corridor, and from the other nothing is."""
+    rng = np.random.default_rng(seed)
+    action = rng.uniform(-1, 1, (6000, 2)).repeat(3, 0)[:6000]
+    place = np.tile([5.0, 15.0], (6001, 1))
+    for t in range(6000):
+        place[t + 1] = (place[t] + action[t]).clip(0, [10, 60])
+    across, along = place[:, 0] / 10, np.minimum(place[:, 1], 30) / 30
+    seen = [np.stack([*[across] * 6, along, along], 1)]
+    looks = [(place[:, 1] >= 30).astype(np.int64)]
+    (shift,), *_ = find_shifts(looks, seen, [((action + 1) / 2).astype(np.float32)], 0.1)
+    is_out_of_sight = (place[:-1, 1] > 32) & (place[:-1, 1] < 58)
+    error = np.abs(shift - np.diff(place, axis=0))[is_out_of_sight, 1]
+    assert error.mean() < 0.01  # 0.09 to 0.18, if all looks count the same
