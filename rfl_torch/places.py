@@ -27,7 +27,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
-from rfl_torch.looks import LOOK_RADII, LOOK_STEPS
+from rfl_torch.looks import LOOK_STEPS
 from rfl_torch.planner import look_alikes
 from rfl_torch.shifts import find_shifts
 
@@ -93,9 +93,10 @@ CLEAR = 0.5
 """Share of a log's steps at known looks that must agree with its start for no other to be asked."""
 
 STRANGE = 4.0
-"""Weight of a step that saw what was never seen near a place, nor right before or after what was.
-At a right start none or one in a hundred does, of a robot that went straight through unknown land 6
-(whose looks are new there in 41), and at one in the wrong of two rooms that look alike many."""
+"""Weight of a step that saw what was never seen near a place, nor the like, nor what is seen right
+before or after it. At a right start none or one in a hundred does, of a robot that went straight
+through unknown land 6 (whose looks are new there in 41), and at one in the wrong of two rooms that
+look alike many."""
 
 COMES_BACK, NEARER = 3.0, 0.3
 """Full actions that a track may be, when it comes back to a look, from the nearest place of that
@@ -386,12 +387,14 @@ class KnownPlaces:
 
 
 def _much_alike(looks: list[Labels], observations: list[Array], radius: float) -> csr_array:
-    """Looks whose mean sights are within LOOK_RADII of each other, bool (L, L)."""
+    """Looks whose mean sights are within a look's radius of each other, bool (L, L).
+
+    Within 1.5 a room counts for another that looks alike but for a ray or two.
+    """
     look = np.concatenate(looks)
     num_looks = int(look.max()) + 1
     mean = middles(look, observations, num_looks)
-    most = LOOK_RADII * radius * mean.shape[1]
-    i, j = cKDTree(mean).query_pairs(most, p=1, output_type="ndarray").T
+    i, j = cKDTree(mean).query_pairs(radius * mean.shape[1], p=1, output_type="ndarray").T
     alike = csr_array((np.ones(len(i), bool), (i, j)), shape=(num_looks, num_looks))
     return csr_array(alike + alike.T + eye_array(num_looks) > 0)
 
