@@ -394,9 +394,7 @@ def _much_alike(looks: list[Labels], observations: list[Array], radius: float) -
     look = np.concatenate(looks)
     num_looks = int(look.max()) + 1
     mean = middles(look, observations, num_looks)
-    i, j = cKDTree(mean).query_pairs(radius * mean.shape[1], p=1, output_type="ndarray").T
-    alike = csr_array((np.ones(len(i), bool), (i, j)), shape=(num_looks, num_looks))
-    return csr_array(alike + alike.T + eye_array(num_looks) > 0)
+    return _close(mean, radius * mean.shape[1], p=1.0)
 
 
 class _Waiting:
@@ -610,9 +608,14 @@ def surroundings(edges: csr_array, positions: Array | None, most: float = NODE_S
     near = within(edges, NEAR)
     if positions is None:
         return near
-    i, j = cKDTree(positions).query_pairs(most, output_type="ndarray").T
-    beside = csr_array((np.ones(len(i), bool), (i, j)), shape=near.shape)
-    return csr_array(near + beside + beside.T > 0)
+    return csr_array(near + _close(positions, most) > 0)
+
+
+def _close(points: Array, most: float, p: float = 2.0) -> csr_array:
+    """Points (N, D) at most so far apart by the p-norm, each itself among them, bool (N, N)."""
+    i, j = cKDTree(points).query_pairs(most, p, output_type="ndarray").T
+    pairs = csr_array((np.ones(len(i), bool), (i, j)), shape=(len(points), len(points)))
+    return csr_array(pairs + pairs.T + eye_array(len(points)) > 0)
 
 
 def find_telling(twins: csr_array, edges: csr_array, positions: Array | None) -> Labels:

@@ -162,6 +162,7 @@ def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array
                 miss = 0.0
                 for d in range(len(noise)):
                     miss += abs(open_[d] - could * shown[axis, d]) / noise[d]
-                if NATS[k] - EVIDENCE * miss > most:
-                    most, moved[t, axis] = NATS[k] - EVIDENCE * miss, could
+                nats = NATS[k] - EVIDENCE * miss
+                if nats > most:
+                    most, moved[t, axis] = nats, could
     return moved
