@@ -39,7 +39,7 @@ from rfl_torch import (
     record_episodes,
 )
 from rfl_torch.innate import action_bounds
-from rfl_torch.practice import Strategy
+from rfl_torch.practice import Strategy, pace
 from sims.maze import STEP_LENGTH
 
 PEER_HORIZON = 100
@@ -52,9 +52,6 @@ millimetres between the places that are compared."""
 PEER_NEAR = 0.03
 """Mean absolute difference of ranges within which the peer's goal counts as reached in training:
 about a full step."""
-
-LEARN_TASKS = 5
-"""Tasks between two updates of an agent that learns from what it did in them."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +289,7 @@ class Judge:
             done += [bool(trial.is_true) for trial in scoring.run_tasks(*run)]
             fresh.append(watched.take())
             is_half = number + 1 in (len(tasks) // 2, len(tasks))
-            if not is_half and len(fresh) < LEARN_TASKS:
+            if not is_half and sum(part.num_steps for part in fresh) < pace(agent):
                 continue
             begin = time.perf_counter()
             agent.partial_fit([part for part in fresh if part.num_steps])

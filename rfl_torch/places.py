@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.ndimage import uniform_filter1d
 from scipy.sparse import csr_array, diags_array, eye_array, triu
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
@@ -92,11 +93,16 @@ MOST_STARTS = 10
 CLEAR = 0.5
 """Share of a log's steps at known looks that must agree with its start for no other to be asked."""
 
-STRANGE = 4.0
-"""Weight of a step that saw what was never seen near a place, nor the like, nor what is seen right
-before or after it. At a right start none or one in a hundred does, of a robot that went straight
-through unknown land 6 (whose looks are new there in 41), and at one in the wrong of two rooms that
-look alike many."""
+STRANGE = 8.0
+"""Weight of a step that saw, at a place, what was never seen near it, nor the like, nor what is
+seen right before or after it; the less, the farther it is from any place, up to none at a look's
+reach. At a right start none or one in a hundred does, of a robot that went straight through unknown
+land 6 (whose looks are new there in 41), and at one in the wrong of two rooms that look alike
+many."""
+
+BEND = 101
+"""Steps over which a track may drift from another: where a log must begin, is asked of each such
+part of it by itself."""
 
 COMES_BACK, NEARER = 3.0, 0.3
 """Full actions that a track may be, when it comes back to a look, from the nearest place of that
@@ -333,7 +339,7 @@ class KnownPlaces:
             log = waiting[k]
             if log.num_known != num_known[k]:
                 log.num_known = num_known[k]
-                log.start, log.agreement = self.find_start(log.places)
+                log.start, log.agreement = self.find_start(*log.places)
             if best is None or log.agreement > waiting[best].agreement:
                 best = k
             if log.agreement > CLEAR * might[k]:
@@ -342,11 +348,12 @@ class KnownPlaces:
             return best, waiting[best].start
         return first, self.position.max(0) + 100 * PLACE_STEPS + waiting[first].length
 
-    def find_start(self, own: "KnownPlaces") -> tuple[Array, float]:
+    def find_start(self, own: "KnownPlaces", path: Labels) -> tuple[Array, float]:
         """Where a log must begin, (A,), for most of its looks to be seen at known places.
 
         Args:
             own: places of the log, begun at 0, one of whose looks is known.
+            path: those of its steps, (T+1,).
 
         Returns:
             The start, and the steps that agree with it, less those that don't.
@@ -362,18 +369,50 @@ class KnownPlaces:
             best = near[int(left.argmax())]
             starts.append(np.average(offset[best], axis=0, weights=vote[best]))
             left[best] = 0.0
-        agreement = [self._agreement(own, start) for start in starts]
+        agreement = [self._agreement(own, self._bend(own, path, start)) for start in starts]
         best = int(np.argmax(agreement))
         return starts[best], agreement[best]
 
-    def _agreement(self, other: "KnownPlaces", start: Array) -> float:
-        """Steps of another track, begun at `start`, that saw what is known to be seen there.
+    def _bend(self, other: "KnownPlaces", path: Labels, start: Array) -> Array:
+        """Places of another track, begun at `start`, moved with those of BEND steps around, (N, A).
 
-        Less those, STRANGE times, that saw what was never seen near, nor anything like or beside
-        that, where others were: in one of several rooms that look alike, most of what a robot sees
-        fits the wrong one, too. But where two tracks cross, each saw few of the looks there.
+        Each as far as these are from the places of their looks: by a map that drifted by a few
+        actions a robot in a passage would have been on the other side of a wall.
+
+        Args:
+            other: the track's places, begun at 0.
+            path: those of its steps, (T+1,).
+            start: of the track, (A,).
         """
-        position, steps = other.position + start, other._count[: len(other.look)]
+        position = other.position + start
+        away = np.full_like(position, np.nan)
+        for own, look in enumerate(other.look):
+            if places := self._of_look[look]:
+                off = self._sum[places] / self._count[places, None] - position[own]
+                length = np.linalg.norm(off, axis=1)
+                if length.min() < PLACE_STEPS:
+                    away[own] = off[length.argmin()]
+        has_place = ~np.isnan(away[path]).any(1)
+        near = uniform_filter1d(has_place.astype(np.float64), BEND, mode="constant")
+        off = uniform_filter1d(np.nan_to_num(away[path]), BEND, axis=0, mode="constant")
+        moved = np.divide(
+            off, near[:, None], out=np.zeros_like(off), where=near[:, None] > 0.5 / BEND
+        )
+        return position + middles(path, [moved], len(position))
+
+    def _agreement(self, other: "KnownPlaces", position: Array) -> float:
+        """Steps of another track that saw what is known to be seen where they were.
+
+        Less those, STRANGE times at most, that saw what was never seen near, nor anything like or
+        beside that, where others were: in one of several rooms that look alike, most of what a
+        robot sees fits the wrong one, too. But where two tracks cross, each saw few of the looks
+        there.
+
+        Args:
+            other: the track's places.
+            position: where they are, (N, A).
+        """
+        steps = other._count[: len(other.look)]
         tree, look = cKDTree(self.position), np.array(self.look)
         away, _ = tree.query(position)
         around = tree.query_ball_point(position, PLACE_STEPS)
@@ -382,8 +421,8 @@ class KnownPlaces:
         known, fits = np.zeros((2, len(around)), bool)
         known[step[own == there]] = True
         fits[step[self._beside[own, there] > 0]] = True
-        strange = ~fits & (away < LOOK_STEPS)
-        return float(steps[known].sum() - STRANGE * steps[strange].sum())
+        strange = ~fits * (1 - away / LOOK_STEPS).clip(0.0)
+        return float(steps[known].sum() - STRANGE * steps @ strange)
 
 
 def _much_alike(looks: list[Labels], observations: list[Array], radius: float) -> csr_array:
@@ -407,12 +446,12 @@ class _Waiting:
         self.start, self.agreement = np.zeros(hold.shape[1]), -np.inf
 
     @cached_property
-    def places(self) -> KnownPlaces:
-        """Its own, begun at 0."""
+    def places(self) -> tuple[KnownPlaces, Labels]:
+        """Its own, begun at 0, and those of its steps (T+1,)."""
         look, shift, hold = self._log
         own = KnownPlaces(hold)
-        own.follow(look, shift, np.zeros(hold.shape[1]))
-        return own
+        _, path = own.follow(look, shift, np.zeros(hold.shape[1]))
+        return own, path
 
 
 def find_known_starts(

@@ -211,7 +211,7 @@ def practice(
         attempt = Attempt(begin, goal, on_way, reached, agent.num_nodes, unknown / max(1, on_way))
         history.append(attempt)
         _report(monitor, strategy, history, run.done)
-        if run.pending >= _pace(agent) or run.left == 0:
+        if run.pending >= pace(agent) or run.left == 0:
             agent.partial_fit(run.take_logs(*agent.action_bounds))
             goals.update()
             assert agent.last_seen is not None
@@ -221,8 +221,8 @@ def practice(
     return history
 
 
-def _pace(agent: "Agent") -> float:
-    """Steps until the agent should learn."""
+def pace(agent: "Agent") -> float:
+    """Steps that are worth learning from at once, with `Agent.partial_fit`."""
     num_known = 0 if not agent.has_track else agent.edges.sum()
     return max(LEARN_EVERY, LEARN_SHARE * float(num_known))
 

@@ -132,11 +132,32 @@ def test_a_log_does_not_begin_where_what_it_saw_is_strange():
     known = places.KnownPlaces(np.ones((6, 1)))
     known.follow(*stops((0, 0, 100), (1, 10, 100), (2, 20, 100), (5, 100, 5)), np.zeros(1))
     look, shift = stops((5, 0, 5), (0, 20, 50), (1, 30, 50), (3, 40, 50))
-    own = places.KnownPlaces(known._hold)
-    own.follow(look, shift, np.zeros(1))
-    start, agreement = known.find_start(own)
+    start, agreement = known.find_start(*own_places(look, shift, 6))
     assert start == pytest.approx(100.0, abs=1.0)
-    assert agreement == 5  # at 0 it is 100, less three times 50
+    assert agreement == 5  # at -20 it is 100, less eight times 50
+
+
+def test_a_log_is_known_on_a_map_that_drifted():
+    """Along a hall, every other ten steps five actions to the left or right of the middle.
+
+    By the summed moves some of these are in the middle of the map's hall, which drifted to and fro
+    by four, and where all was seen to look otherwise.
+    """
+    x = np.arange(800)
+    drifted = np.stack([x, 4 * np.sin(x * np.pi / 400)], 1)
+    known = places.KnownPlaces(np.ones((1600, 2)))
+    known.follow(x, np.diff(drifted, axis=0), drifted[0])
+    aside = x % 20 >= 10
+    shift = np.diff(np.stack([x, 5.0 * aside * (-1) ** (x // 20)], 1), axis=0)
+    _, agreement = known.find_start(*own_places(np.where(aside, 800 + x, x), shift, 1600))
+    assert agreement == 400  # of the steps in the middle
+
+
+def own_places(look, shift, num_looks):
+    """Places of a log by itself, and those of its steps."""
+    own = places.KnownPlaces(np.ones((num_looks, shift.shape[1])))
+    _, path = own.follow(look, shift, np.zeros(shift.shape[1]))
+    return own, path
 
 
 def stops(*stays):
