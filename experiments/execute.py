@@ -3,6 +3,7 @@
 python -m experiments.execute --model maze.safetensors --env rfl/RangefinderMaze-v0 --trials 118
 python -m experiments.execute --model maze.safetensors --log log.npz --gif way.gif
 python -m experiments.execute --model acrobot.safetensors --env Acrobot-v1 --hold 4
+python -m experiments.execute --model maze.safetensors --log log.npz --learn better.safetensors
 
 "believed" counts the tasks that the agent says it has done. "true" needs to know where the goals
 are: a maze's places are known, its nodes only by the training log (--log). In an environment
@@ -12,6 +13,8 @@ what they pass by at any time the agent must exceed by where it says that it has
 """
 
 import contextlib
+import copy
+import functools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -23,6 +26,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import cli, figures, scoring
+from experiments.on_the_way import Learner, Watched
 from experiments.scoring import MAZE, NodeTable, Task, Trial, World
 from rfl_torch import Agent
 from rfl_torch.innate import action_bounds
@@ -48,6 +52,9 @@ class Config:
     gif: Path | None = None
     """Animation of a task to write. In our environments it needs --log; elsewhere the environment
     draws itself."""
+    learn: Path | None = None
+    """Learn between the tasks from what was seen and done in them, and write the agent here. Goals
+    are the nodes of the map as it was; --log tells where they truly are."""
     results: Path | None = None
     """JSON file to write every number and task to; `experiments.report` reads a results.json."""
     logdir: Path | None = None
@@ -74,12 +81,18 @@ def main(config: Config) -> None:
     agent = Agent.load(config.model)
     logs = cli.read_all_logs(config.log, config.observation_keys)
     with contextlib.ExitStack() as stack:
-        env, probe = (stack.enter_context(_make_env(config)) for _ in range(2))
+        made = _make_env(config)
+        watched = Watched(made) if config.learn is not None else None
+        env, probe = (
+            stack.enter_context(cli.with_action_rows(each))
+            for each in (made if watched is None else watched, _make_env(config))
+        )
         check_fit(agent, env)
         world = scoring.world_of(env)
         camera = None
         if config.gif is not None and world is None:
-            camera = stack.enter_context(_make_env(config, render_mode="rgb_array"))
+            made = _make_env(config, render_mode="rgb_array")
+            camera = stack.enter_context(cli.with_action_rows(made))
             camera.reset()
             camera.render()  # what it lacks it says now, not after all the tasks
         elif config.gif is not None and not logs:
@@ -98,6 +111,10 @@ def main(config: Config) -> None:
             board = stack.enter_context(TensorBoardMonitor(config.logdir))
             board.config(asdict(config))
         kinds = _tasks(config, agent, env, probe, table, truth)
+        known, learner = agent, None
+        if watched is not None and config.learn is not None:
+            known, save = copy.deepcopy(agent), functools.partial(agent.save, config.learn)
+            learner = Learner(agent, watched, logs, world, save)
         rows, note = [], ""
         tasks_json: dict[str, Any] = {}
         trials_json: dict[str, Any] = {}
@@ -105,7 +122,7 @@ def main(config: Config) -> None:
         limit = config.limit or (FOREIGN_LIMIT if world is None else world.limit)
         for name, tasks in kinds.items():
             start = None if truth is None else truth[-1]
-            trials = run(env, agent, tasks, world, start, config.seed, name, board, limit)
+            trials = run(env, agent, tasks, world, start, config.seed, name, board, limit, learner)
             score = scoring.score(trials, _layout(env))
             rows.append(row(name, score))
             tasks_json[name] = score.to_json()
@@ -116,9 +133,9 @@ def main(config: Config) -> None:
                 elif table is not None:
                     animate(config.gif, env, agent, best_trial(trials), table)
             if world is None:
-                goals = tqdm([trial.goal for trial in trials], desc="random walk", unit="task")
+                goals = tqdm([task.goal for task in tasks], desc="random walk", unit="task")
                 walk = scoring.observed_walk_share(
-                    env, agent, goals, limit, config.hold, config.seed, config.levels
+                    env, known, goals, limit, config.hold, config.seed, config.levels
                 )
                 walks_json[name] = walk._asdict()
                 rows.append(["random walk", "-", str(walk), "-", "-", "-"])
@@ -170,10 +187,12 @@ def run(
     description: str,
     board: TensorBoardMonitor | None = None,
     limit: int | None = None,
+    learner: Learner | None = None,
 ) -> list[Trial]:
     """Run the tasks with a progress bar, and write the running success rate to TensorBoard."""
     trials: list[Trial] = []
-    running = scoring.run_tasks(env, agent, tasks, world, start, seed, limit)
+    shown = tasks if learner is None else learner.between(tasks)
+    running = scoring.run_tasks(env, agent, shown, world, start, seed, limit)
     done = 0
     for trial in (bar := tqdm(running, total=len(tasks), desc=description, unit="task")):
         trials.append(trial)
@@ -242,7 +261,7 @@ def film(path: Path, env: gym.Env, agent: Agent, trial: Trial, limit: int) -> No
 
 def _make_env(config: Config, **more: Any) -> gym.Env:
     arguments = (config.env, config.layout, config.env_kwargs, config.observation_keys)
-    return cli.with_action_rows(cli.make_env(*arguments, **more))
+    return cli.make_env(*arguments, **more)
 
 
 def _tasks(
@@ -279,6 +298,13 @@ def _check(config: Config) -> None:
         cli.check_writable(config.results)
     if config.gif is not None:
         cli.check_writable(config.gif)
+    if config.learn is not None:
+        cli.check_writable(config.learn)
+        if config.gif is not None:
+            raise ValueError(
+                "--gif shows a task that is done again, by a map that --learn has changed; leave "
+                "one of them out, or film the agent that --learn wrote."
+            )
 
 
 def check_fit(agent: Agent, env: gym.Env) -> None:

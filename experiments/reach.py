@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 import sims
 from experiments import cli, figures, scoring
+from experiments.on_the_way import Learner, Watched
 from experiments.scoring import MAZE, PLACE_TOLERANCE, Share, Task, wilson
 from rfl_torch import (
     Agent,
@@ -39,7 +40,7 @@ from rfl_torch import (
     record_episodes,
 )
 from rfl_torch.innate import action_bounds
-from rfl_torch.practice import Strategy, pace
+from rfl_torch.practice import Strategy
 from sims.maze import STEP_LENGTH
 
 PEER_HORIZON = 100
@@ -204,37 +205,8 @@ def _practise(
         begin = time.perf_counter()
         agent.practice(watched, config.practice // 4, seed=4 * seed + part, strategy=strategy)
         seconds += time.perf_counter() - begin
-        logs.append(watched.take())
+        logs += watched.take()
         yield judge.score(f"practice: {strategy}", agent, logs, seconds)
-
-
-class Watched(gym.Wrapper):
-    """Keeps what was seen and done, with the ground truth for the judge."""
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self._seen: list[tuple[Any, Any]] = []
-        self._done: list[Any] = []
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin anew."""
-        observation, info = self.env.reset(**options)
-        self._seen, self._done = [(observation, info["ground_truth"])], []
-        return observation, info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Go on, and keep what is seen."""
-        result = self.env.step(action)
-        self._seen.append((result[0], result[4]["ground_truth"]))
-        self._done.append(action)
-        return result
-
-    def take(self) -> Trajectory:
-        """What was seen and done since the last reset."""
-        bounds = action_bounds(self.action_space)
-        observations, truth = (np.stack(part) for part in zip(*self._seen, strict=True))
-        actions = np.reshape(self._done, (-1, len(bounds[0]))).astype(np.float32)
-        return Trajectory(observations, actions, *bounds, truth)
 
 
 def know_places(agent: Agent, log: Trajectory, seed: int) -> Agent:
@@ -277,30 +249,15 @@ class Judge:
         The goals are those of `score`: the nodes that truly lie where the map's nodes lay before,
         whatever their numbers are now. A row for each half.
         """
-        agent, logs, watched = copy.deepcopy(start), [log], Watched(self._env)
-        known = scoring.node_table(agent, [log], MAZE)
-        _, tasks = self._node_tasks(agent, known)
-        seconds, fresh, done = 0.0, list[Trajectory](), list[bool]()
-        for number, task in enumerate(tasks):
-            assert task.target is not None
-            away = np.linalg.norm(known.mean - task.target, axis=1)
-            task = task._replace(goal=int(np.nanargmin(away)))
-            run = (watched, agent, [task], MAZE, None, self._seed + number)
-            done += [bool(trial.is_true) for trial in scoring.run_tasks(*run)]
-            fresh.append(watched.take())
-            is_half = number + 1 in (len(tasks) // 2, len(tasks))
-            if not is_half and sum(part.num_steps for part in fresh) < pace(agent):
-                continue
-            begin = time.perf_counter()
-            agent.partial_fit([part for part in fresh if part.num_steps])
-            seconds += time.perf_counter() - begin
-            logs += fresh
-            fresh = []
-            known = scoring.node_table(agent, [log], MAZE)
-            if is_half:
-                table = scoring.node_table(agent, logs, MAZE)
-                yield self._row(name, agent, logs, table, seconds, None, _share(done))
-                done = []
+        agent, watched = copy.deepcopy(start), Watched(self._env)
+        learner = Learner(agent, watched, [log], MAZE)
+        _, tasks = self._node_tasks(agent, scoring.node_table(agent, [log], MAZE))
+        half = len(tasks) // 2
+        for begin, part in ((0, tasks[:half]), (half, tasks[half:])):
+            run = (watched, agent, learner.between(part), MAZE, None, self._seed + begin)
+            share = _share([bool(trial.is_true) for trial in scoring.run_tasks(*run)])
+            table = scoring.node_table(agent, learner.logs, MAZE)
+            yield self._row(name, agent, learner.logs, table, learner.seconds, None, share)
 
     def _node_tasks(self, agent: Agent, table: scoring.NodeTable) -> tuple[list[Task], list[Task]]:
         """Nodes of a map to go to, and the same with a start anywhere in the room for each."""

@@ -105,6 +105,18 @@ def test_execute_without_the_log_knows_places_but_no_nodes(tmp_path, model, caps
     assert list((tmp_path / "tb").iterdir())
 
 
+def test_execute_learns_between_the_tasks_if_told_to(tmp_path, log, model, capsys):
+    out, before = tmp_path / "better.safetensors", model.read_bytes()
+    config = execute.Config(model=model, trials=3, limit=300, log=(str(log),), learn=out)
+    execute.main(config)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:]] == [
+        "nodes",
+        "places",
+    ]
+    assert Agent.load(out).edges.sum() > Agent.load(model).edges.sum() + 50
+    assert model.read_bytes() == before
+
+
 def test_practice_learns_more_and_tells_by_strategy(tmp_path, model, capsys):
     out = tmp_path / "practised.safetensors"
     config = practice.Config(model, out, num_steps=120, strategy="random", logdir=tmp_path / "tb")
@@ -248,6 +260,8 @@ def test_output_that_cannot_be_written_is_refused_before_work(tmp_path, capsys, 
         (["--limit", "0"], "--limit is 0"),
         (["--goal", "999"], "--goal is 999"),
         (["--gif", "way.gif"], "--log"),
+        (["--gif", "way.gif", "--learn", "better.safetensors"], "leave one of them out"),
+        (["--learn", "."], "folder"),
         (["--env", PENDULUM], "the agent learned"),
     ],
 )
