@@ -157,6 +157,9 @@ def main(config: Config) -> None:
         with cli.replacing(config.results) as new:
             new.write_text(json.dumps(results, indent=2) + "\n")
     print(cli.table(HEADER, rows) + note)
+    if config.learn is not None:
+        agent.save(config.learn)  # which it was not yet if there was nothing to learn from
+        print(f"{config.learn}: {known.num_nodes} nodes before, {agent.num_nodes} now")
 
 
 FOREIGN_LIMIT = 200

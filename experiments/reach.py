@@ -254,6 +254,8 @@ class Judge:
         _, tasks = self._node_tasks(agent, scoring.node_table(agent, [log], MAZE))
         half = len(tasks) // 2
         for begin, part in ((0, tasks[:half]), (half, tasks[half:])):
+            if not part:  # of one task
+                continue
             run = (watched, agent, learner.between(part), MAZE, None, self._seed + begin)
             share = _share([bool(trial.is_true) for trial in scoring.run_tasks(*run)])
             table = scoring.node_table(agent, learner.logs, MAZE)

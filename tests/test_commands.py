@@ -109,10 +109,9 @@ def test_execute_learns_between_the_tasks_if_told_to(tmp_path, log, model, capsy
     out, before = tmp_path / "better.safetensors", model.read_bytes()
     config = execute.Config(model=model, trials=3, limit=300, log=(str(log),), learn=out)
     execute.main(config)
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:]] == [
-        "nodes",
-        "places",
-    ]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[2:]] == ["nodes", "places", f"{out}:"]
+    assert lines[-1].endswith(f"{Agent.load(out).num_nodes} now")
     assert Agent.load(out).edges.sum() > Agent.load(model).edges.sum() + 50
     assert model.read_bytes() == before
 
