@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from experiments import scoring
-from experiments.scoring import Task, World
+from experiments.scoring import NodeTable, Task, World
 from rfl_torch import Agent, Trajectory
 from rfl_torch.innate import action_bounds
 from rfl_torch.practice import pace
@@ -81,9 +81,8 @@ class Learner:
         learned: Callable[[], None] | None = None,
     ) -> None:
         self._agent, self._env, self._world, self._learned = agent, env, world, learned
-        self._known = logs if world is not None else []
-        self._spots = agent.positions
-        self._table = scoring.node_table(agent, logs, world) if logs and world else None
+        self._known, self._spots = logs, agent.positions
+        self._table: NodeTable | None = None
         self._fresh: list[Trajectory] = []
         self.logs = list(logs)
         """All that it has learned from."""
@@ -124,7 +123,8 @@ class Learner:
             return task
         if self._table is not None and task.target is not None and self._world is not None:
             away = self._world.distance(self._table.mean, task.target)
-            return task._replace(goal=int(np.nanargmin(away)))
+            if not np.isnan(away).all():  # else no log was at the goal
+                return task._replace(goal=int(np.nanargmin(away)))
         if self._spots is not None and self._agent.positions is not None:
             away = np.linalg.norm(self._agent.positions - self._spots[task.goal], axis=1)
             return task._replace(goal=int(away.argmin()))

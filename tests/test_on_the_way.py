@@ -76,6 +76,9 @@ def test_a_goal_stays_where_it_was_when_the_map_is_laid_out_anew(agent, log, is_
     else:
         away = agent.positions[again.goal] - before[tasks[0].goal]
         assert np.linalg.norm(away) < 2.2  # full actions of 10 mm
+    (unknown,) = learner.between([tasks[0]._replace(target=np.full(2, np.nan))])
+    away = agent.positions[unknown.goal] - before[tasks[0].goal]
+    assert np.linalg.norm(away) < 2.2  # where no log was, by the map
     sight = log.observations[0]
     (place,) = learner.between([Task(sight, None)])
     assert place.goal is sight
