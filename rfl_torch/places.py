@@ -252,10 +252,15 @@ class KnownPlaces:
         places = [k for k in self._of_look[look] if self._num_steps - self._born[k] > OLD]
         if not places:
             return None
-        away = self._sum[places] / self._count[places, None] - here
-        length = np.linalg.norm(away, axis=1)
+        _, way, length = self._nearest(places, here)
+        return way if length < MOST_DRIFT else None
+
+    def _nearest(self, places: list[int], here: Array) -> tuple[int, Array, float]:
+        """Of some places the nearest to a position (A,), the way there (A,), and its length."""
+        way = self._sum[places] / self._count[places, None] - here
+        length = np.linalg.norm(way, axis=1)
         nearest = int(length.argmin())
-        return away[nearest] if length[nearest] < MOST_DRIFT else None
+        return places[nearest], way[nearest], float(length[nearest])
 
     def comes_back(self) -> bool:
         """Whether looks seen again after long were near their places, much nearer than others."""
@@ -266,20 +271,14 @@ class KnownPlaces:
 
     def _away(self, look: int, here: Array) -> float:
         """Distance of a position from the nearest place of a look, which has one."""
-        places = self._of_look[look]
-        middle = self._sum[places] / self._count[places, None]
-        return float(np.linalg.norm(middle - here, axis=1).min())
+        return self._nearest(self._of_look[look], here)[2]
 
     def _visit(self, look: int, here: Array) -> tuple[int, Array]:
         """The place of a look at a position, a new one if need be; and the position, corrected."""
         places = self._of_look[look]
-        if places:
-            middle = self._sum[places] / self._count[places, None]
-            away = np.linalg.norm(middle - here, axis=1)
-            nearest = int(away.argmin())
-        if places and away[nearest] < PLACE_STEPS:
-            node = places[nearest]
-            here = here + PULL * self._hold[look] * (middle[nearest] - here)
+        node, way, length = self._nearest(places, here) if places else (-1, here, np.inf)
+        if length < PLACE_STEPS:
+            here = here + PULL * self._hold[look] * way
         else:
             node = len(self.look)
             self.look.append(look)
@@ -388,13 +387,13 @@ class KnownPlaces:
         away = np.full_like(position, np.nan)
         for own, look in enumerate(other.look):
             if places := self._of_look[look]:
-                off = self._sum[places] / self._count[places, None] - position[own]
-                length = np.linalg.norm(off, axis=1)
-                if length.min() < PLACE_STEPS:
-                    away[own] = off[length.argmin()]
+                _, way, length = self._nearest(places, position[own])
+                if length < PLACE_STEPS:
+                    away[own] = way
         has_place = ~np.isnan(away[path]).any(1)
         near = uniform_filter1d(has_place.astype(np.float64), BEND, mode="constant")
         off = uniform_filter1d(np.nan_to_num(away[path]), BEND, axis=0, mode="constant")
+        # Running means: a part without any place may have a share of 1e-17 of them.
         moved = np.divide(
             off, near[:, None], out=np.zeros_like(off), where=near[:, None] > 0.5 / BEND
         )
