@@ -9,6 +9,7 @@ from experiments import scoring
 from experiments.on_the_way import Learner, Watched
 from experiments.scoring import MAZE, Task
 from rfl_torch import Agent, AgentConfig, Stage, record
+from rfl_torch.practice import LEARN_EVERY
 
 STAGES = (Stage(3, 60, (0.01, 1.0), pseudo_count=0.01, min_scale=0.05, tolerance=0.0),)
 
@@ -68,6 +69,7 @@ def test_a_goal_stays_where_it_was_when_the_map_is_laid_out_anew(agent, log, is_
     assert sum(part.num_steps for part in learner.logs[len(known[0]) :]) == done
     assert len(agent.memory.node) == num_steps + done + len(learner.logs[len(known[0]) :])
     assert calls[-1] == agent.num_nodes > len(before) + 20
+    assert done / LEARN_EVERY >= len(calls) - 1 > 0  # between tasks, and once at the end
     assert learner.seconds > 0
     (again,) = learner.between(tasks[:1])
     if is_truth_known:
