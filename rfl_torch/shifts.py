@@ -1,13 +1,17 @@
 """How far each step of some logs went: what was asked for, or less where a wall stood in the way.
 
-Around each look, the change of the readings is linear in the move, and a move is the action but for
-those of its dimensions in which something was in the way:
+Around each look, the change of the readings is linear in the move. A move is the action, but for
+those of its dimensions in which something was in the way, or what is left of two of its dimensions
+along a slanted wall:
 
-    c_t = B_l (q_t * u_t) + e_t        q_td in SHARES, most likely 1; e_t Laplace by reading
+    c_t = B_l m_t + e_t                e_t Laplace by reading
+    m_t = q_t * u_t                    q_td in SHARES, most likely 1
+    m_t = (u_t . s) s                  in two dimensions, s in SLIDES
 
-B_l, the noise and the shares are found in turns, first by regressing actions on changes. Where no
-reading changes with a dimension of the action, as halfway along a wide corridor, nothing is in
-sight that could be in the way there, and what was asked for counts as done.
+B_l, the noise and the moves are found in turns: begun with what a regression of the actions on the
+changes says, and with all done that was asked for, whichever ends likelier. Where no reading
+changes with a dimension of the action, as halfway along a wide corridor, nothing is in sight that
+could be in the way there, and what was asked for counts as done.
 """
 
 from typing import NamedTuple
@@ -40,14 +44,28 @@ shortens what is measured of noisy readings until rooms are mixed."""
 MOVE_RIDGE = 1e-3
 """Of the changes' regression, as moves of one full action a step."""
 
-SHARES = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-"""Of an action's dimension that may have been moved."""
+SHARES = np.linspace(1.0, 0.0, 11)
+"""Of an action's dimension that may have been moved. Fewer, and a slide explains better what was
+stopped on the way, by a move along the wall that hardly shows."""
 
-NATS = np.log([0.05, 0.05 / 3, 0.05 / 3, 0.05 / 3, 0.9])
+NATS = np.log([0.85, *[0.1 / 9] * 9, 0.05])
 """Log probabilities of the shares."""
 
-EVIDENCE = 0.25
+SLIDES = np.array([(np.cos(x), np.sin(x)) for x in np.pi / 16 * np.arange(16) if x % (np.pi / 2)])
+"""Directions in two dimensions that a wall may have, (S, 2); along one of them shares do."""
+
+SLIDE_NATS = float(np.log(0.1 / len(SLIDES)))
+"""Log probability of each."""
+
+BY_BOTH = 0.1
+"""Nats that each of its dimensions must explain: where one doesn't show, a wall is in the way of
+the other."""
+
+EVIDENCE = 0.5
 """Share of the readings' log likelihoods that counts, for one thing changes many of them."""
+
+TURNS = 3
+"""Times that what shows is learned from the likeliest moves, and those by what shows."""
 
 FLOOR = 0.05
 """Of the noise, as a share of a full action's usual change."""
@@ -110,10 +128,10 @@ def find_shifts(
         asked, seen = action[near], change[near]
         gain = _ridge(seen, asked, weight, RIDGE * max(float((weight @ seen**2).sum()), 1e-12))
         measured[steps] = change[steps] @ gain
-        moved = np.where((seen @ gain) * asked > 0.5 * asked**2, asked, 0.0)
-        moved = _likeliest(seen, asked, *_what_shows(moved, seen, weight, unit))
-        shown, noise = _what_shows(moved, seen, weight, unit)
-        shift[steps] = _likeliest(change[steps], action[steps], shown, noise)
+        regressed = np.where((seen @ gain) * asked > 0.5 * asked**2, asked, 0.0)
+        found = [_what_shows_by(start, asked, seen, weight, unit) for start in (regressed, asked)]
+        shown, noise, _ = max(found, key=lambda one: one[2])
+        shift[steps], _ = _likeliest(change[steps], action[steps], shown, noise)
         misfit[steps] = (np.abs(change[steps] - shift[steps] @ shown) / noise).mean(1)
         grip[own] = np.minimum(1.0, np.abs(shown).mean(1) / unit)
     measured /= np.maximum(1.0, np.abs(measured).max(1, keepdims=True))
@@ -133,13 +151,26 @@ def _ridge(inputs: Array, outputs: Array, weight: Array, penalty: float) -> Arra
 def _what_shows(moved: Array, seen: Array, weight: Array, unit: float) -> tuple[Array, Array]:
     """Change of the readings for a full action in each dimension, (A, D), and their noise, (D,)."""
     shown = _ridge(moved, seen, weight, MOVE_RIDGE * float(weight.sum()))
-    noise = np.average(np.abs(seen - moved @ shown), axis=0, weights=weight)
+    noise = weight @ np.abs(seen - moved @ shown) / weight.sum()
     return shown, noise + FLOOR * unit
 
 
+def _what_shows_by(
+    moved: Array, asked: Array, seen: Array, weight: Array, unit: float
+) -> tuple[Array, Array, float]:
+    """`_what_shows` by the likeliest moves from a first guess (T, A), and its likelihood [nat]."""
+    for _ in range(TURNS):
+        shown, noise = _what_shows(moved, seen, weight, unit)
+        moved, nats = _likeliest(seen, asked, shown, noise)
+    nats -= EVIDENCE * np.log(noise).sum()
+    return *_what_shows(moved, seen, weight, unit), float(weight @ nats)
+
+
 @njit(nogil=True, cache=True)
-def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array:
-    """The likeliest moves (T, A), each dimension twice with the others as they are.
+def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> tuple[Array, Array]:
+    """The likeliest moves (T, A) and how likely they are [nat], (T,).
+
+    Each dimension is sought twice with the others as they are, then slides.
 
     Args:
         change: of the readings, (T, D).
@@ -147,22 +178,63 @@ def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array
         shown: change of the readings for a full action in each dimension, (A, D).
         noise: of each reading, (D,).
     """
-    moved, open_ = asked.copy(), np.empty(len(noise))
-    dim = asked.shape[1]
+    moved, dim = asked.copy(), asked.shape[1]
+    nats = np.empty(len(asked))
+    change, shown, prior = change / noise, shown / noise, np.empty(dim)
+    left = np.empty(len(noise))
     for t in range(len(asked)):
         for turn in range(2 * dim):
             axis = turn % dim
-            open_[:] = change[t]
-            for other in range(dim):
-                if other != axis:
-                    open_ -= moved[t, other] * shown[other]
+            _explain(left, change[t], moved[t], shown, axis, axis)
             most = -np.inf
             for k in range(len(SHARES)):
-                could = asked[t, axis] * SHARES[k]
-                miss = 0.0
-                for d in range(len(noise)):
-                    miss += abs(open_[d] - could * shown[axis, d]) / noise[d]
-                nats = NATS[k] - EVIDENCE * miss
-                if nats > most:
-                    most, moved[t, axis] = nats, could
-    return moved
+                x = asked[t, axis] * SHARES[k]
+                own = NATS[k] - _against(left, x, shown[axis], 0.0, shown[axis])
+                if own > most:
+                    most, moved[t, axis], prior[axis] = own, x, NATS[k]
+        for i in range(dim):
+            for j in range(i + 1, dim):
+                _explain(left, change[t], moved[t], shown, i, j)
+                most = prior[i] + prior[j]
+                most -= _against(left, moved[t, i], shown[i], moved[t, j], shown[j])
+                for k in range(len(SLIDES)):
+                    along = asked[t, i] * SLIDES[k, 0] + asked[t, j] * SLIDES[k, 1]
+                    x, y = along * SLIDES[k, 0], along * SLIDES[k, 1]
+                    miss = _against(left, x, shown[i], y, shown[j])
+                    by_one = min(
+                        _against(left, x, shown[i], asked[t, j], shown[j]),
+                        _against(left, asked[t, i], shown[i], y, shown[j]),
+                    )
+                    if SLIDE_NATS - miss > most and miss < by_one - BY_BOTH:
+                        most, moved[t, i], moved[t, j] = SLIDE_NATS - miss, x, y
+                        prior[i] = prior[j] = SLIDE_NATS / 2
+        _explain(left, change[t], moved[t], shown, -1, -1)
+        nats[t] = prior.sum() - EVIDENCE * np.abs(left).sum()
+    return moved, nats
+
+
+@njit(nogil=True, cache=True)
+def _explain(left: Array, change: Array, moved: Array, shown: Array, i: int, j: int) -> None:
+    """What a change of the readings (D,) is but for a move (A,) in all dimensions except two."""
+    left[:] = change
+    for axis in range(len(moved)):
+        if axis not in (i, j):
+            for d in range(len(left)):
+                left[d] -= moved[axis] * shown[axis, d]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _against(left: Array, x: float, by_x: Array, y: float, by_y: Array) -> float:
+    """Nats that a change of the readings speaks against a move.
+
+    Args:
+        left: the change that two dimensions of the move must explain, over its noise, (D,).
+        x: the move in the first of them, in full actions.
+        by_x: change that a full action in it makes, over its noise, (D,).
+        y: in the second.
+        by_y: by that one.
+    """
+    miss = 0.0
+    for d in range(len(left)):
+        miss += abs(left[d] - x * by_x[d] - y * by_y[d])
+    return EVIDENCE * miss

@@ -1,5 +1,7 @@
 """What is counted as moved, against where the robot was."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -36,12 +38,25 @@ def test_shifts_are_what_was_moved_and_not_what_was_asked_for(layout, hold):
     assert np.linalg.norm((shift - moved).sum(0)) < 10
 
 
+def test_what_slides_along_a_slanted_wall_is_what_was_moved(tmp_path):
+    """Two walls at 30 and 60 degrees: by shares of each dimension alone it is 0.34 off (median)."""
+    walls = [[150, 200, 500, 402], [550, 100, 750, 446]]
+    plan = tmp_path / "slanted.json"
+    plan.write_text(json.dumps({"size": [900, 600], "walls": walls, "start": [100, 100]}))
+    shift, asked, moved, *_ = walk_in(str(plan), 6000, 10)
+    slid = (np.abs(moved - asked) > 0.2).all(1) & (np.abs(moved) > 0.1).all(1)
+    assert slid.sum() > 100
+    error = np.linalg.norm(shift - moved, axis=1)
+    assert np.median(error[slid]) < 0.1
+    assert np.quantile(error[slid], 0.8) < 0.2
+
+
 def test_a_shift_is_wrong_where_the_readings_do_not_fit_it():
     shift, _, moved, _, misfit = walk_in("paper", 6000, 10)
     error = np.linalg.norm(shift - moved, axis=1)
     assert np.median(misfit) == pytest.approx(1.0)
     assert np.square(error[misfit < 1.0]).mean() < 0.01**2
-    assert np.square(error[misfit > np.quantile(misfit, 0.99)]).mean() > 0.1**2
+    assert np.square(error[misfit > np.quantile(misfit, 0.99)]).mean() > 0.04**2
 
 
 def test_noise_is_told_from_walls():
@@ -68,8 +83,8 @@ def test_what_no_reading_shows_counts_as_done():
     (shift,), _, share, grip = find_shifts(looks, seen, unit, 0.05)
     moved = np.diff(place, axis=0)
     assert np.abs(shift[:, 1] - action[:, 1]).max() < 1e-6
-    # Shares are quarters, and a tenth of the steps end at a wall.
-    assert np.abs(shift[:, 0] - moved[:, 0]).mean() < 0.02
+    # Shares are tenths, and a tenth of the steps end at a wall.
+    assert np.abs(shift[:, 0] - moved[:, 0]).mean() < 0.01
     # Half of the actions' variance is in y, and shows nowhere.
     assert 0.4 < share < 0.6
     assert grip[:, 0].min() > 0.7
