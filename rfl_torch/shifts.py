@@ -57,7 +57,7 @@ SLIDES = np.array([(np.cos(x), np.sin(x)) for x in np.pi / 16 * np.arange(16) if
 SLIDE_NATS = float(np.log(0.1 / len(SLIDES)))
 """Log probability of each."""
 
-BY_BOTH = 0.1
+BY_BOTH = 1.0
 """Nats that each of its dimensions must explain: where one doesn't show, a wall is in the way of
 the other."""
 
