@@ -161,7 +161,10 @@ def _what_shows_by(
     """`_what_shows` by the likeliest moves from a first guess (T, A), and its likelihood [nat]."""
     for _ in range(TURNS):
         shown, noise = _what_shows(moved, seen, weight, unit)
+        before = moved
         moved, nats = _likeliest(seen, asked, shown, noise)
+        if (moved == before).all():
+            break
     nats -= EVIDENCE * np.log(noise).sum()
     return *_what_shows(moved, seen, weight, unit), float(weight @ nats)
 
@@ -197,6 +200,8 @@ def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> tuple
                 _explain(left, change[t], moved[t], shown, i, j)
                 most = prior[i] + prior[j]
                 most -= _against(left, moved[t, i], shown[i], moved[t, j], shown[j])
+                if most >= SLIDE_NATS:  # no slide is likelier
+                    continue
                 for k in range(len(SLIDES)):
                     along = asked[t, i] * SLIDES[k, 0] + asked[t, j] * SLIDES[k, 1]
                     x, y = along * SLIDES[k, 0], along * SLIDES[k, 1]
