@@ -57,14 +57,14 @@ def test_a_goal_stays_where_it_was_when_the_map_is_laid_out_anew(agent, log, is_
     """From anywhere in the room, most of which the log does not know."""
     table = scoring.node_table(agent, [log], MAZE)
     rng, before, num_steps = np.random.default_rng(0), agent.positions, len(agent.memory.node)
-    tasks = scoring.node_tasks(np.arange(agent.num_nodes), table, 4, rng)
+    tasks = scoring.node_tasks(np.arange(agent.num_nodes), table, 8, rng)
     with gym.make("rfl/RangefinderMaze-v0", layout="paper") as env:
         tasks = scoring.from_anywhere(tasks, env, None, rng)
         watched, calls = Watched(env), []
         known = ([log], MAZE) if is_truth_known else ([], None)
         learner = Learner(agent, watched, *known, lambda: calls.append(agent.num_nodes))
         trials = list(scoring.run_tasks(watched, agent, learner.between(tasks), MAZE, None, 0))
-    assert len(trials) == 4
+    assert len(trials) == 8
     done = sum(trial.outcome.num_steps for trial in trials)
     assert sum(part.num_steps for part in learner.logs[len(known[0]) :]) == done
     assert len(agent.memory.node) == num_steps + done + len(learner.logs[len(known[0]) :])
