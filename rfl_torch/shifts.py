@@ -61,7 +61,7 @@ BY_BOTH = 1.0
 """Nats that each of its dimensions must explain: where one doesn't show, a wall is in the way of
 the other."""
 
-EVIDENCE = 0.5
+EVIDENCE = 0.25
 """Share of the readings' log likelihoods that counts, for one thing changes many of them."""
 
 TURNS = 3
