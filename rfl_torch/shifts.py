@@ -159,14 +159,15 @@ def _what_shows_by(
     moved: Array, asked: Array, seen: Array, weight: Array, unit: float
 ) -> tuple[Array, Array, float]:
     """`_what_shows` by the likeliest moves from a first guess (T, A), and its likelihood [nat]."""
+    shown, noise = _what_shows(moved, seen, weight, unit)
     for _ in range(TURNS):
-        shown, noise = _what_shows(moved, seen, weight, unit)
         before = moved
         moved, nats = _likeliest(seen, asked, shown, noise)
+        nats -= EVIDENCE * np.log(noise).sum()
         if (moved == before).all():
             break
-    nats -= EVIDENCE * np.log(noise).sum()
-    return *_what_shows(moved, seen, weight, unit), float(weight @ nats)
+        shown, noise = _what_shows(moved, seen, weight, unit)
+    return shown, noise, float(weight @ nats)
 
 
 @njit(nogil=True, cache=True)

@@ -56,7 +56,7 @@ def test_a_shift_is_wrong_where_the_readings_do_not_fit_it():
     error = np.linalg.norm(shift - moved, axis=1)
     assert np.median(misfit) == pytest.approx(1.0)
     assert np.square(error[misfit < 1.0]).mean() < 0.01**2
-    assert np.square(error[misfit > np.quantile(misfit, 0.99)]).mean() > 0.04**2
+    assert np.square(error[misfit > np.quantile(misfit, 0.99)]).mean() > 0.1**2
 
 
 def test_noise_is_told_from_walls():
