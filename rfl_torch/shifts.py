@@ -8,10 +8,9 @@ along a slanted wall:
     m_t = q_t * u_t                    q_td in SHARES, most likely 1
     m_t = (u_t . s) s                  in two dimensions, s in SLIDES
 
-B_l, the noise and the moves are found in turns: begun with what a regression of the actions on the
-changes says, and with all done that was asked for, whichever ends likelier. Where no reading
-changes with a dimension of the action, as halfway along a wide corridor, nothing is in sight that
-could be in the way there, and what was asked for counts as done.
+B_l, the noise and the moves are found in turns, first by regressing actions on changes. Where no
+reading changes with a dimension of the action, as halfway along a wide corridor, nothing is in
+sight that could be in the way there, and what was asked for counts as done.
 """
 
 from typing import NamedTuple
@@ -128,10 +127,14 @@ def find_shifts(
         asked, seen = action[near], change[near]
         gain = _ridge(seen, asked, weight, RIDGE * max(float((weight @ seen**2).sum()), 1e-12))
         measured[steps] = change[steps] @ gain
-        regressed = np.where((seen @ gain) * asked > 0.5 * asked**2, asked, 0.0)
-        found = [_what_shows_by(start, asked, seen, weight, unit) for start in (regressed, asked)]
-        shown, noise, _ = max(found, key=lambda one: one[2])
-        shift[steps], _ = _likeliest(change[steps], action[steps], shown, noise)
+        moved = np.where((seen @ gain) * asked > 0.5 * asked**2, asked, 0.0)
+        shown, noise = _what_shows(moved, seen, weight, unit)
+        for _ in range(TURNS):
+            before, moved = moved, _likeliest(seen, asked, shown, noise)
+            if (moved == before).all():
+                break
+            shown, noise = _what_shows(moved, seen, weight, unit)
+        shift[steps] = _likeliest(change[steps], action[steps], shown, noise)
         misfit[steps] = (np.abs(change[steps] - shift[steps] @ shown) / noise).mean(1)
         grip[own] = np.minimum(1.0, np.abs(shown).mean(1) / unit)
     measured /= np.maximum(1.0, np.abs(measured).max(1, keepdims=True))
@@ -155,26 +158,9 @@ def _what_shows(moved: Array, seen: Array, weight: Array, unit: float) -> tuple[
     return shown, noise + FLOOR * unit
 
 
-def _what_shows_by(
-    moved: Array, asked: Array, seen: Array, weight: Array, unit: float
-) -> tuple[Array, Array, float]:
-    """`_what_shows` by the likeliest moves from a first guess (T, A), and its likelihood [nat]."""
-    shown, noise = _what_shows(moved, seen, weight, unit)
-    for _ in range(TURNS):
-        before = moved
-        moved, nats = _likeliest(seen, asked, shown, noise)
-        nats -= EVIDENCE * np.log(noise).sum()
-        if (moved == before).all():
-            break
-        shown, noise = _what_shows(moved, seen, weight, unit)
-    return shown, noise, float(weight @ nats)
-
-
 @njit(nogil=True, cache=True)
-def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> tuple[Array, Array]:
-    """The likeliest moves (T, A) and how likely they are [nat], (T,).
-
-    Each dimension is sought twice with the others as they are, then slides.
+def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> Array:
+    """The likeliest moves (T, A): each dimension twice with the others as they are, then slides.
 
     Args:
         change: of the readings, (T, D).
@@ -183,7 +169,6 @@ def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> tuple
         noise: of each reading, (D,).
     """
     moved, dim = asked.copy(), asked.shape[1]
-    nats = np.empty(len(asked))
     change, shown, prior = change / noise, shown / noise, np.empty(dim)
     left = np.empty(len(noise))
     for t in range(len(asked)):
@@ -214,9 +199,7 @@ def _likeliest(change: Array, asked: Array, shown: Array, noise: Array) -> tuple
                     if SLIDE_NATS - miss > most and miss < by_one - BY_BOTH:
                         most, moved[t, i], moved[t, j] = SLIDE_NATS - miss, x, y
                         prior[i] = prior[j] = SLIDE_NATS / 2
-        _explain(left, change[t], moved[t], shown, -1, -1)
-        nats[t] = prior.sum() - EVIDENCE * np.abs(left).sum()
-    return moved, nats
+    return moved
 
 
 @njit(nogil=True, cache=True)
