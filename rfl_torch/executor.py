@@ -24,6 +24,7 @@ from rfl_torch.planner import cost_to_go, reachability_path, threshold_graph
 from rfl_torch.search import LookSearch
 from rfl_torch.senses import FEW, Sensors, apart, believed, sensible
 from rfl_torch.steering import SteeringExecutor
+from rfl_torch.trail import Trail
 
 if TYPE_CHECKING:
     from rfl_torch.agent import Agent
@@ -170,6 +171,8 @@ class BeliefExecutor:
         self._seed = seed
         self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
         self._explorer: Explorer | None = None
+        self._trail: Trail | None = None
+        self._refuted = 0
         self._is_exploring = self._is_led = False
         self._cut_off = 0
         self.is_familiar = True
@@ -222,9 +225,27 @@ class BeliefExecutor:
         self._is_led = False
         action = self._decide(observation)
         self._note_action(action)
-        if self._explorer is not None and self._did is not None and not self._is_led:
-            self._explorer.watch(self._sensors.working(self._sensed), self._did)
+        if self._explorer is not None and self._did is not None:
+            working = self._sensors.working(self._sensed)
+            if not self._is_led:
+                self._explorer.watch(working, self._did)
+            self._look_back(self._explorer.position, working)
         return action
+
+    def _look_back(self, position: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
+        """Take note of whether what was seen on the way here speaks against the belief.
+
+        Args:
+            position: where the robot is by its own count, (A,).
+            normal: what it sees, (D,).
+        """
+        if self._trail is None:
+            return
+        self._trail.note(position, normal)
+        is_wrong = self._trail.speaks_against(self.node, position - self._where[self.node])
+        self._refuted = self._refuted + 1 if is_wrong else 0
+        if self._refuted > LONGEST_ASTRAY:
+            self._trail.clear()
 
     def _note_action(self, action: NDArray[np.float32] | None) -> None:
         """Remember what was done, in full actions."""
@@ -234,6 +255,7 @@ class BeliefExecutor:
         self._sensed = sensible(self._agent.normalize(observation))
         normal = self._recognize(self._sensed)
         is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._is_exploring
+        is_lost = is_lost or self._refuted > 0
         seems_there = self.belief[self._goals].sum() > 0.5 and self._knows_where
         is_homing = self._homing is not None and self._homing.has_begun
         if self.status == "running" and (is_homing or (seems_there and self._trusts_sight())):
@@ -299,16 +321,23 @@ class BeliefExecutor:
 
     def _explore(self, known: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
         """Go to where nothing was seen yet; places (N, A), counted from here, are known."""
-        if self._explorer is None:
-            self._explorer = self._agent.explorer(self._seed)
+        self._set_out()
+        assert self._explorer is not None
         if known is not None:
             self._explorer.know(known)
         self._is_led = True
         return self._explorer.act(self._sensors.working(self._sensed))
 
+    def _set_out(self) -> None:
+        """Count the steps from here on, and keep what is seen."""
+        agent = self._agent
+        if self._explorer is None and agent.free_ways is not None and agent.positions is not None:
+            self._explorer = agent.explorer(self._seed)
+            self._trail = Trail(agent.positions, agent._mean, agent.edges, agent.look_radius)
+
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar, not after many strange ones, and a jump was proved."""
-        if self._confirmed < CONFIRMED or self._landed >= 0:
+        if self._confirmed < CONFIRMED or self._landed >= 0 or self._refuted:
             return False
         return self.is_familiar and sum(self._recent) >= SOME * len(self._recent)
 
@@ -337,20 +366,20 @@ class BeliefExecutor:
         if not self._beyond.size:  # the map has nothing that could prove it
             self._landed = -1
 
-    def _ask_where(self, before: int, is_plain: bool) -> None:
+    def _ask_where(self, before: int) -> None:
         """Take note of whether the robot knows which of the places that look like this it is at.
 
-        It does once it was where no other place looks the same, and as long as it goes on from node
-        to node: a belief that jumps, jumps to what looks right. Until then no place is the goal.
+        It does once it was where no other place looks the same, all of the last sights plainly what
+        the log saw where the robot then was, and as long as it goes on from node to node: a belief
+        that jumps, jumps to what looks right. Until then no place is the goal.
 
         Args:
             before: node of the last step; -1 if there is none.
-            is_plain: what is seen is as likely as what the log saw at the node.
         """
         if not self._can_be_unsure:
             return
         is_telling = self.node in self._agent.telling
-        if is_telling and (is_plain or self._astray > LONGEST_ASTRAY):
+        if is_telling and (self._plain >= CONFIRMED or self._astray > LONGEST_ASTRAY):
             self._knows_where = True
         elif before >= 0 and not self._agent.near[before, self.node] and self._knows_where:
             self._jumps += 1
@@ -395,21 +424,19 @@ class BeliefExecutor:
         self.belief = belief / belief.sum()
         self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
-        is_plain = bool(seen[self.node] >= self._agent.least_familiar)
+        is_plain = seen[self.node] >= self._agent.least_familiar
         self._known = self._known + 1 if self.is_familiar else 0
         self._plain = self._plain + 1 if is_plain else 0
         self._was_known |= self._known >= CONFIRMED
-        if self._plain >= CONFIRMED or (self._knows_where and self._known >= CONFIRMED):
+        is_known = self._plain >= CONFIRMED or (self._knows_where and self._known >= CONFIRMED)
+        if is_known and not self._refuted:
             self._is_exploring = False
-            # Else it may be a room that looks the same, or one from which no way is known.
-            if self._knows_where and not self._cut_off:
-                self._explorer = None
         # What is wrong where it asks which place this is may be the place, not the sensor.
         is_asking = not self._knows_where and self.node in self._agent.telling
         if self.is_familiar and not is_asking:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
         self._ask_whether(before)
-        self._ask_where(before, is_plain)
+        self._ask_where(before)
         return normal
 
     def _doubt(
@@ -444,11 +471,10 @@ class BeliefExecutor:
         only guess.
         """
         uniform = np.full(self._agent.num_nodes, 1.0 / self._agent.num_nodes)
-        if self._agent.last_seen is None:
-            return uniform
-        seen, belief = self._agent.last_seen
+        seen, belief = self._agent.last_seen or (normal, uniform[:0])
         is_same = apart(seen, normal) <= self._agent.look_radius / LOOK_STEPS
         if not is_same or len(belief) != len(uniform):
+            self._set_out()
             return uniform
         self._knows_where = self._was_known = True
         return (1 - FORGOTTEN) * belief + FORGOTTEN * uniform
@@ -462,6 +488,7 @@ class BeliefExecutor:
             observation: what is seen now, (D,).
             action: what was done since the last observation, (A,); None if that isn't known.
         """
+        self._explorer, self._trail, self._refuted = None, None, 0  # they count its own steps
         self._note_action(action)
         self._recognize(sensible(self._agent.normalize(observation)))
 

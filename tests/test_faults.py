@@ -63,6 +63,7 @@ def way_beyond(agent, sights, node):
 
 def stand_and_walk(executor, sights, way):
     """Whether an arrival is said while the robot stands at its goal, and once it was elsewhere."""
+    executor._trail = None  # what is shown here doesn't come of what it does
     for _ in range(3 * CONFIRMED):
         executor.act(sights[way[0]])
     assert executor.node == way[0]

@@ -737,24 +737,21 @@ def test_a_robot_put_into_a_room_that_no_log_knows_comes_back_from_it(left_half)
 
 
 def test_a_robot_is_done_exploring_where_what_it_sees_is_plainly_the_maps(left_half):
-    """Inside one of two bays that look the same it goes by the map to see which it is, and keeps
-    what it explored until it did."""
+    """Inside one of two bays that look the same it goes by the map to see which it is."""
     log, agent = left_half
     is_telling = np.isin(agent.recognize(log.observations), agent.telling)
     inside = int(np.flatnonzero(np.convolve(~is_telling, np.ones(30), "valid") == 30)[0])
     agent.last_seen = None
     executor = agent.executor(int(agent.telling[0]))
-    executor._is_exploring, executor._explorer = True, agent.explorer(0)
+    executor._is_exploring = True
     for step in range(inside, inside + 30):
         executor.watch(log.observations[step], log.actions[step - 1])
     assert not executor._is_exploring
     assert not executor._knows_where
-    assert executor._explorer is not None
     outside = inside + int(is_telling[inside:].argmax())
     for step in range(inside + 30, outside + 30):
         executor.watch(log.observations[step], log.actions[step - 1])
     assert executor._knows_where
-    assert executor._explorer is None
 
 
 @pytest.fixture(scope="module")
