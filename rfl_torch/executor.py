@@ -172,6 +172,8 @@ class BeliefExecutor:
         self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
         self._explorer: Explorer | None = None
         self._trail: Trail | None = None
+        self._place = np.empty(0)  # on the trail
+        self._last_place = np.empty(0), np.empty(0), -1
         self._refuted = 0
         self._is_exploring = self._is_led = False
         self._cut_off = 0
@@ -229,23 +231,31 @@ class BeliefExecutor:
             working = self._sensors.working(self._sensed)
             if not self._is_led:
                 self._explorer.watch(working, self._did)
-            self._look_back(self._explorer.position, working)
+            if self._trail is not None:
+                self._look_back(self._explorer, self._trail, working)
         return action
 
-    def _look_back(self, position: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
+    def _look_back(self, explorer: Explorer, trail: Trail, normal: NDArray[np.float64]) -> None:
         """Take note of whether what was seen on the way here speaks against the belief.
 
+        While the map is followed from node to node it says how far the robot came: a slide along a
+        wall can't be counted.
+
         Args:
-            position: where the robot is by its own count, (A,).
-            normal: what it sees, (D,).
+            explorer: counts the steps.
+            trail: keeps what is seen.
+            normal: what is seen now, (D,).
         """
-        if self._trail is None:
-            return
-        self._trail.note(position, normal)
-        is_wrong = self._trail.speaks_against(self.node, position - self._where[self.node])
+        counted, where = explorer.position, self._where[self.node]
+        last_counted, last_where, last_node = self._last_place
+        follows = not self._is_led and self.is_familiar and self._agent.near[last_node, self.node]
+        self._place = self._place + (where - last_where if follows else counted - last_counted)
+        self._last_place = counted, where, self.node
+        trail.note(self._place, normal)
+        is_wrong = trail.speaks_against(self.node, self._place - where)
         self._refuted = self._refuted + 1 if is_wrong else 0
         if self._refuted > LONGEST_ASTRAY:
-            self._trail.clear()
+            trail.clear()
 
     def _note_action(self, action: NDArray[np.float32] | None) -> None:
         """Remember what was done, in full actions."""
@@ -334,6 +344,8 @@ class BeliefExecutor:
         if self._explorer is None and agent.free_ways is not None and agent.positions is not None:
             self._explorer = agent.explorer(self._seed)
             self._trail = Trail(agent.positions, agent._mean, agent.edges, agent.look_radius)
+            self._place = self._explorer.position
+            self._last_place = self._place, self._where[max(self.node, 0)], max(self.node, 0)
 
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar, not after many strange ones, and a jump was proved."""

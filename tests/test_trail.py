@@ -9,6 +9,7 @@ from scipy.sparse import csr_array
 from test_places import SMALL, trials
 
 from rfl_torch import Agent, record
+from rfl_torch.explorer import Explorer
 from rfl_torch.trail import AROUND, MOST_SIGHTS, SPACING, Trail
 
 RADIUS = 0.1
@@ -144,3 +145,13 @@ def test_a_robot_in_an_unknown_lane_that_looks_like_a_known_one_finds_back(lanes
     ends = [(300.0, 320.0), (700.0, 320.0), (300.0, 480.0), (700.0, 720.0)] * 2
     done = trials(agent, [log], layout, starts, ends)
     assert sum(trial.is_true for trial in done) >= 6
+
+
+def test_a_robot_that_follows_the_map_is_where_the_map_says_however_it_counts(lanes, monkeypatch):
+    """Where it slides along a wall it counts wrongly. Counted for 1.25, all four tasks fail."""
+    layout, log, agent = lanes
+    watch = Explorer.watch
+    monkeypatch.setattr(Explorer, "watch", lambda own, seen, did: watch(own, seen, 1.25 * did))
+    starts = [(250.0, 480.0), (600.0, 700.0), (700.0, 500.0), (400.0, 700.0)]
+    ends = [(800.0, 320.0), (300.0, 300.0), (200.0, 320.0), (500.0, 480.0)]
+    assert all(trial.is_true for trial in trials(agent, [log], layout, starts, ends))
