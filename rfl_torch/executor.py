@@ -313,6 +313,10 @@ class BeliefExecutor:
         """Look for what is known."""
         if self._agent.free_ways is None:
             return self._search.act(normal)
+        if not self._is_exploring and self._trail is not None and not self._cut_off:
+            # It was led by what it believed, so what it took for explored may be elsewhere.
+            self._explorer = self._agent.explorer(self._seed)
+            self._last_place = self._explorer.position, *self._last_place[1:]
         self._is_exploring = True
         return self._explore()
 
@@ -378,20 +382,20 @@ class BeliefExecutor:
         if not self._beyond.size:  # the map has nothing that could prove it
             self._landed = -1
 
-    def _ask_where(self, before: int) -> None:
+    def _ask_where(self, before: int, is_plain: bool) -> None:
         """Take note of whether the robot knows which of the places that look like this it is at.
 
-        It does once it was where no other place looks the same, all of the last sights plainly what
-        the log saw where the robot then was, and as long as it goes on from node to node: a belief
-        that jumps, jumps to what looks right. Until then no place is the goal.
+        It does once it was where no other place looks the same, and as long as it goes on from node
+        to node: a belief that jumps, jumps to what looks right. Until then no place is the goal.
 
         Args:
             before: node of the last step; -1 if there is none.
+            is_plain: what is seen is as likely as what the log saw at the node.
         """
         if not self._can_be_unsure:
             return
         is_telling = self.node in self._agent.telling
-        if is_telling and (self._plain >= CONFIRMED or self._astray > LONGEST_ASTRAY):
+        if is_telling and (is_plain or self._astray > LONGEST_ASTRAY):
             self._knows_where = True
         elif before >= 0 and not self._agent.near[before, self.node] and self._knows_where:
             self._jumps += 1
@@ -436,7 +440,7 @@ class BeliefExecutor:
         self.belief = belief / belief.sum()
         self._agent.last_seen = normal, self.belief
         self.node = int(self.belief.argmax())
-        is_plain = seen[self.node] >= self._agent.least_familiar
+        is_plain = bool(seen[self.node] >= self._agent.least_familiar)
         self._known = self._known + 1 if self.is_familiar else 0
         self._plain = self._plain + 1 if is_plain else 0
         self._was_known |= self._known >= CONFIRMED
@@ -448,7 +452,7 @@ class BeliefExecutor:
         if self.is_familiar and not is_asking:
             self._sensors.note(sensed, self._agent._mean[self.node], self._agent.look_radius)
         self._ask_whether(before)
-        self._ask_where(before)
+        self._ask_where(before, is_plain)
         return normal
 
     def _doubt(
