@@ -876,7 +876,7 @@ class Agent:
 
         NaN if all its readings are missing.
         """
-        return apart(normal, self._mean[node]) / self.look_radius
+        return float(apart(normal, self._mean[node])) / self.look_radius
 
     def node_width(self, nodes: NDArray[np.int64]) -> NDArray[np.float64]:
         """How far from the nodes' (G,) means observations of them are, (G,).

@@ -172,8 +172,7 @@ class BeliefExecutor:
         self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
         self._explorer: Explorer | None = None
         self._trail: Trail | None = None
-        self._place = np.empty(0)  # on the trail
-        self._last_place = np.empty(0), np.empty(0), -1
+        self._last_place: tuple[NDArray[np.float64], NDArray[np.float64], int] | None = None
         self._refuted = 0
         self._is_exploring = self._is_led = False
         self._cut_off = 0
@@ -246,13 +245,12 @@ class BeliefExecutor:
             trail: keeps what is seen.
             normal: what is seen now, (D,).
         """
-        counted, where = explorer.position, self._where[self.node]
-        last_counted, last_where, last_node = self._last_place
-        follows = not self._is_led and self.is_familiar and self._agent.near[last_node, self.node]
-        self._place = self._place + (where - last_where if follows else counted - last_counted)
-        self._last_place = counted, where, self.node
-        trail.note(self._place, normal)
-        is_wrong = trail.speaks_against(self.node, self._place - where)
+        place = counted, where, node = explorer.position, self._where[self.node], self.node
+        last_counted, last_where, last_node = self._last_place or place
+        follows = not self._is_led and self.is_familiar and self._agent.near[last_node, node]
+        trail.note(where - last_where if follows else counted - last_counted, normal)
+        self._last_place = place
+        is_wrong = trail.speaks_against(node, trail.position - where)
         self._refuted = self._refuted + 1 if is_wrong else 0
         if self._refuted > LONGEST_ASTRAY:
             trail.clear()
@@ -315,8 +313,7 @@ class BeliefExecutor:
             return self._search.act(normal)
         if not self._is_exploring and self._trail is not None and not self._cut_off:
             # It was led by what it believed, so what it took for explored may be elsewhere.
-            self._explorer = self._agent.explorer(self._seed)
-            self._last_place = self._explorer.position, *self._last_place[1:]
+            self._explorer, self._last_place = self._agent.explorer(self._seed), None
         self._is_exploring = True
         return self._explore()
 
@@ -348,8 +345,7 @@ class BeliefExecutor:
         if self._explorer is None and agent.free_ways is not None and agent.positions is not None:
             self._explorer = agent.explorer(self._seed)
             self._trail = Trail(agent.positions, agent._mean, agent.edges, agent.look_radius)
-            self._place = self._explorer.position
-            self._last_place = self._place, self._where[max(self.node, 0)], max(self.node, 0)
+            self._last_place = None
 
     def _trusts_sight(self) -> bool:
         """Whether this sight is familiar, not after many strange ones, and a jump was proved."""

@@ -118,7 +118,7 @@ class Homing:
             normal: what is seen, (D,).
             node: where the robot is.
         """
-        away = apart(normal, self._sight) / self._agent.look_radius
+        away = float(apart(normal, self._sight)) / self._agent.look_radius
         is_closer = away < self._least - CLOSER
         self._off = np.zeros_like(self._off) if is_closer else self._off + self._moved(normal)
         self._since = 0 if is_closer else self._since + 1

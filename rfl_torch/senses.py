@@ -6,8 +6,6 @@ wall was moved, up to half of them don't fit: then only places that the robot ma
 A sensor that is wrong at one familiar place after the other is broken, and goes missing.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,11 +40,16 @@ def sensible(normal: Array) -> Array:
     return np.where(np.abs(normal) <= FARTHEST, normal, np.nan)
 
 
-def apart(a: Array, b: Array) -> float:
-    """Mean absolute difference over the readings that both have; NaN if there is none."""
+def apart(a: Array, b: Array) -> Array:
+    """Mean absolute difference (...) of observations (..., D), over the readings that both have.
+
+    NaN where there is none.
+    """
     difference = np.abs(a - b)
     is_there = ~np.isnan(difference)
-    return float(difference[is_there].mean()) if is_there.any() else math.nan
+    num = is_there.sum(-1)
+    total = np.where(is_there, difference, 0.0).sum(-1)
+    return np.where(num > 0, total / np.maximum(num, 1), np.nan)
 
 
 def believed(normal: Array, mean: Array, predicted: Array, radius: float) -> tuple[Array, float]:

@@ -13,6 +13,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from rfl_torch.senses import apart
+
 Array = NDArray[np.float64]
 
 SPACING = 3.0
@@ -53,6 +55,8 @@ class Trail:
         self._in_part = -1
         self._place = np.empty((MOST_SIGHTS, positions.shape[1]))
         self._sight = np.empty((MOST_SIGHTS, means.shape[1]))
+        self.position = np.zeros(positions.shape[1])
+        """Where the robot is, counted from where it was put, in full actions, (A,)."""
         self._last: Array | None = None
         self._is_there = np.ones(means.shape[1], bool)
         self._asked: tuple[Array, bool] | None = None
@@ -63,24 +67,25 @@ class Trail:
         self._num = 0
         self._asked = None
 
-    def note(self, position: Array, normal: Array) -> None:
-        """Keep what is seen (D,) at a position (A,), if it wasn't seen from there before.
+    def note(self, moved: Array, normal: Array) -> None:
+        """After a move (A,), keep what is seen (D,), if it wasn't seen from there before.
 
         A robot that suddenly sees something else was moved, so what came before says nothing.
         """
+        self.position = self.position + moved
         is_there = ~np.isnan(normal)
         if not is_there.any():
             return
         if (is_there != self._is_there).any():  # a sensor that is found to be broken was before
             self._is_there, self._asked = is_there, None
-        if self._last is not None and _unlike(self._last, normal) > MOVED * self._radius:
+        if self._last is not None and apart(self._last, normal) > MOVED * self._radius:
             self.clear()
         self._last = normal
         kept = self._place[: min(self._num, MOST_SIGHTS)]
-        if len(kept) and np.abs(kept - position).max(1).min() < SPACING:
+        if len(kept) and np.abs(kept - self.position).max(1).min() < SPACING:
             return
         at = self._num % MOST_SIGHTS
-        self._place[at], self._sight[at] = position, normal
+        self._place[at], self._sight[at] = self.position, normal
         self._num, self._asked = self._num + 1, None
 
     def speaks_against(self, node: int, origin: Array) -> bool:
@@ -102,13 +107,6 @@ class Trail:
         is_near = np.isfinite(away)
         looks = self._means[self._nodes[np.where(is_near, near, 0)]]
         sight = np.where(self._is_there, self._sight[:num], np.nan)
-        unlike = np.where(is_near, _unlike(looks, sight[:, None]), np.inf).min(1) / self._radius
+        unlike = np.where(is_near, apart(looks, sight[:, None]), np.inf).min(1) / self._radius
         against = int(((away[:, 0] <= KNOWN) & (unlike > 1.0)).sum())
         return against > FEWEST and against > MOST_AGAINST * (against + int((unlike <= 1.0).sum()))
-
-
-def _unlike(seen: Array, other: Array) -> Array:
-    """Mean absolute difference (...) of observations (..., D), over the readings that there are."""
-    away = np.abs(seen - other)
-    is_there = ~np.isnan(away)
-    return np.where(is_there, away, 0.0).sum(-1) / np.maximum(is_there.sum(-1), 1)

@@ -35,8 +35,13 @@ def walked(nodes, edges, way, start):
     """The trail of a robot that goes a way (T, 2), counted from where it starts."""
     trail = Trail(nodes, sight(nodes), edges, RADIUS)
     for position in way:
-        trail.note(position - start, sight(position))
+        see(trail, position - start, sight(position))
     return trail
+
+
+def see(trail, position, seen):
+    """What is seen at a position, counted from where the robot was put."""
+    trail.note(position - trail.position, seen)
 
 
 WAY = np.stack([np.linspace(10, 45, 60), np.linspace(20, 40, 60)], 1)
@@ -53,10 +58,10 @@ def test_only_the_true_place_agrees_with_the_way(world):
 
 def test_what_drifted_by_less_than_what_is_around_agrees(world):
     nodes, edges = world
-    drift = np.linspace(0.0, AROUND - 3.0, len(WAY))[:, None] * [1.0, 0.0]
-    trail = Trail(nodes, sight(nodes), edges, RADIUS)
+    drift = np.linspace(0.0, AROUND - 1.0, len(WAY))[:, None] * [1.0, 0.0]
+    trail = Trail(nodes, sight(nodes), edges, 0.6 * RADIUS)  # seen alike up to 4 actions off
     for position, off in zip(WAY, drift, strict=True):
-        trail.note(position - WAY[0] + off, sight(position))
+        see(trail, position - WAY[0] + off, sight(position))
     assert not trail.speaks_against(0, drift[-1] - WAY[0])
 
 
@@ -66,7 +71,7 @@ def test_going_to_and_fro_adds_nothing(world):
     trail = walked(nodes, edges, WAY, WAY[0])
     wrong = -WAY[0] + [15.0, 0.0]
     for position in np.tile(WAY[:2], (100, 1)):
-        trail.note(position - WAY[0], sight(position + np.array([15.0, 0.0])))
+        see(trail, position - WAY[0], sight(position + np.array([15.0, 0.0])))
     assert trail.speaks_against(0, wrong)
 
 
@@ -93,10 +98,10 @@ def test_a_robot_that_is_carried_away_begins_anew(world):
     nodes, edges = world
     trail = Trail(nodes, np.where(nodes[:, :1] < 30, 0.0, 1.0) * np.ones(6), edges, RADIUS)
     for position in np.arange(0.0, 24.0):
-        trail.note(np.array([position, 30.0]), np.zeros(6))
+        see(trail, np.array([position, 30.0]), np.zeros(6))
     carried = np.array([24.0, 0.0])  # so far to the right, which its own count doesn't know
     for position in np.arange(24.0, 30.0):
-        trail.note(np.array([position, 30.0]), np.ones(6))
+        see(trail, np.array([position, 30.0]), np.ones(6))
     assert not trail.speaks_against(0, -carried)
 
 
@@ -106,10 +111,10 @@ def test_a_sensor_that_is_found_to_be_broken_was_broken_before(world):
     for position in WAY:
         seen = sight(position)
         seen[2] = 3.0
-        trail.note(position - WAY[0], seen)
+        see(trail, position - WAY[0], seen)
     assert trail.speaks_against(0, -WAY[0])
     seen[2] = np.nan
-    trail.note(WAY[-1] - WAY[0], seen)
+    see(trail, WAY[-1] - WAY[0], seen)
     assert not trail.speaks_against(0, -WAY[0])
 
 
@@ -119,9 +124,9 @@ def test_a_long_way_keeps_its_last_sights(world):
     far = np.stack([np.arange(-2 * SPACING * MOST_SIGHTS, 0, SPACING), np.full(400, 30.0)], 1)
     trail = Trail(nodes, sight(nodes), edges, RADIUS)
     for position in far:
-        trail.note(position, np.full(6, 0.5))
+        see(trail, position, np.full(6, 0.5))
     for position in WAY:
-        trail.note(position, sight(position))
+        see(trail, position, sight(position))
     assert not trail.speaks_against(0, np.zeros(2))
     assert trail.speaks_against(0, np.array([15.0, 0.0]))
 
