@@ -549,7 +549,7 @@ class Agent:
         if actions[0].shape[1] > MOST_DIMENSIONS:
             return
         self.positions = places.middles(node, positions, self.num_nodes)
-        self.free_ways = learn_free_ways(positions, seen, shifts, actions)
+        self.free_ways = learn_free_ways(positions, seen, shifts, actions, *self._own_units())
         self.contact = learn_contact(seen, shifts, actions)
 
     def _repair(
@@ -783,6 +783,17 @@ class Agent:
         period = self.observation_period[used]
         return unwrap_to_circles(kept, period) if period.any() else kept
 
+    def _own_units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What 0 and 1 of each normalised reading stand for: the lowest, and the range, (E,) each.
+
+        A reading laid on a circle has no unit but its own.
+        """
+        (used,) = np.nonzero(self.observation_scale > 0)
+        plain = used[self.observation_period[used] == 0]
+        low, scale = self.observation_low[plain], self.observation_scale[plain]
+        num_laid = 2 * (len(used) - len(plain))
+        return np.append(low, np.zeros(num_laid)), np.append(scale, np.ones(num_laid))
+
     def raw_readings(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Undo `normalize`: the readings that changed in the log, in the robot's units."""
         (used,) = np.nonzero(self.observation_scale > 0)
@@ -935,6 +946,10 @@ class Agent:
         )
         full = mend(action, asked, self.positions[node] - where)
         return self.action_of_move(full)
+
+    def is_near(self, node: int, other: int) -> bool:
+        """Whether one node is in the surroundings of another, or is it."""
+        return other in self._around(node)
 
     def _around(self, node: int) -> NDArray[np.int64]:
         return np.asarray(self.near.indices[self.near.indptr[node] : self.near.indptr[node + 1]])

@@ -247,7 +247,7 @@ class BeliefExecutor:
         """
         place = counted, where, node = explorer.position, self._where[self.node], self.node
         last_counted, last_where, last_node = self._last_place or place
-        follows = not self._is_led and self.is_familiar and self._agent.near[last_node, node]
+        follows = not self._is_led and self.is_familiar and self._agent.is_near(last_node, node)
         trail.note(where - last_where if follows else counted - last_counted, normal)
         self._last_place = place
         is_wrong = trail.speaks_against(node, trail.position - where)
@@ -363,8 +363,8 @@ class BeliefExecutor:
         Args:
             before: node of the last step; -1 if there is none.
         """
-        near = self._agent.near
-        has_jumped = before >= 0 and not near[before, self.node]
+        agent = self._agent
+        has_jumped = before >= 0 and not agent.is_near(before, self.node)
         if has_jumped:
             self._confirmed = 0
         elif self._confirmed < CONFIRMED:
@@ -372,8 +372,8 @@ class BeliefExecutor:
         if has_jumped or self._unfamiliar >= LOST:
             if self._landed != self.node:
                 self._landed = self.node
-                self._beyond = np.flatnonzero(~near[[self.node]].toarray()[0])
-        elif self._landed >= 0 and self.is_familiar and not near[self._landed, self.node]:
+                self._beyond = np.flatnonzero(~agent.near[[self.node]].toarray()[0])
+        elif self._landed >= 0 and self.is_familiar and not agent.is_near(self._landed, self.node):
             self._landed = -1
         if not self._beyond.size:  # the map has nothing that could prove it
             self._landed = -1
@@ -393,7 +393,7 @@ class BeliefExecutor:
         is_telling = self.node in self._agent.telling
         if is_telling and (is_plain or self._astray > LONGEST_ASTRAY):
             self._knows_where = True
-        elif before >= 0 and not self._agent.near[before, self.node] and self._knows_where:
+        elif self._knows_where and before >= 0 and not self._agent.is_near(before, self.node):
             self._jumps += 1
             self._knows_where = self._jumps > MOST_JUMPS
         # What looks wrong there is off the map, if it isn't the senses that are wrong.

@@ -21,14 +21,10 @@ Array = NDArray[np.float64]
 CELL = 4.0
 """Full actions from end to end of a cell."""
 
-NEAR_WALL = 15.0
-"""Full actions within which the end of a free way is taken for a wall; the logs say less of how far
-a long way goes on."""
-
 BEYOND, BLIND = 5.0, 2.0
 """Radii of a look by which the readings, on average, may be beyond all that the logs read, and full
-actions that each way is taken to be free if they are: of a hall, a log from a corridor's end can't
-tell how far its ways go."""
+actions that each way that no one reading tells is taken to be free if they are: of a hall, a log
+from a corridor's end can't tell how far its ways go."""
 
 BLOCKED_COST = 20.0
 """Cells that a detour may take rather than through one that is surely blocked. At 6 a robot probes
@@ -107,7 +103,7 @@ class Explorer:
         self._low, self._high = low, high
         self._free_ways, self._contact = free_ways, contact
         self._rng = np.random.default_rng(seed)
-        self._ways = ways(len(low))
+        self._ways, self._wall_within = ways(len(low)), free_ways.wall_within
         self._most_beyond = BEYOND * radius
         unit = radius / LOOK_STEPS
         self._lag = int(np.clip(np.ceil(free_ways.still / (NOISE_SHARE * unit)), 1, MOST_LAG))
@@ -211,11 +207,11 @@ class Explorer:
         """Take note of the cells that look free, and of those behind."""
         lengths = self._free_ways.at(normal)
         if np.abs(normal - normal.clip(0.0, 1.0)).mean() > self._most_beyond:
-            lengths = np.full_like(lengths, BLIND)
+            lengths = np.where(self._free_ways.carries_over, lengths, BLIND)
         free, blocked = [], []
-        for way, length in zip(self._ways, lengths, strict=True):
+        for way, length, most in zip(self._ways, lengths, self._wall_within, strict=True):
             free.append(self._along(way, 1.0, max(length - 1.0, 1.01)))
-            if length < NEAR_WALL:
+            if length < most:
                 blocked.append(self._along(way, length + 1.0, length + 1.0 + CELL))
         self._cells.see(np.concatenate(free), np.concatenate(blocked or [free[0][:0]]))
 

@@ -1,9 +1,14 @@
 """How far each way is free, by what is seen: learned from where the logs went.
 
 A robot that is off its map knows nothing of the room but what it sees. Its logs tell what a free
-way looks like: from each place on the track (`places`) the track itself went so far. A linear
-function of the readings carries over to places that no log saw; a small network, more right where
-the logs were, is less so elsewhere.
+way looks like. A reading that falls by the same amount with every move along a way, wherever the
+robot is, points there, as one of a rangefinder's rays does; from its lowest value on it counts how
+far the way goes on, in places as well that no log saw. In a log of one corridor several readings
+fall so. Those that look past the way fall by more, in their own unit, than the one along it.
+
+Where no reading does, free ways are a linear function of all, fitted to how far the track
+(`places`) itself went on from each place; a small network, more right where the logs were, is less
+so elsewhere.
 """
 
 from typing import NamedTuple
@@ -28,6 +33,26 @@ NUM_SIGHTS = 5000
 RIDGE = 1e-4
 """Of the fit, a sight."""
 
+COURSE = 0.995
+"""Cosine from which on a move goes along a way."""
+
+MOST_STEPS, LEAST_MOVE, MOST_MOVE = 8, 2.0, 8.0
+"""Steps that a move takes at most, and full actions that it goes."""
+
+FEWEST_MOVES = 50
+"""That tell by how much a reading falls."""
+
+ALIKE, LEAST_ALIKE, NEARLY = 0.1, 0.3, 0.9
+"""Share of the usual fall that a move's may be off for being alike; moves that must be alike for a
+reading to tell how far a way goes on; and share of the most alike that is as good."""
+
+SLANT = 0.2
+"""Logarithm of a fall by which it may be off what it should be along a way."""
+
+WALL_TOLD, WALL_GUESSED = 30.0, 15.0
+"""Full actions within which the end of a way is a wall, by a reading that points there, and by all:
+the farther, the less it is told which cell it is in; and what all say of long ways is vague."""
+
 FEWEST = 10
 """Steps against a wall that tell how much readings change at one."""
 
@@ -41,6 +66,20 @@ class FreeWays(NamedTuple):
 
     weight: Array
     still: float
+
+    @property
+    def carries_over(self) -> NDArray[np.bool_]:
+        """Whether a way is told by a reading that points along it, (W,)."""
+        return np.asarray(np.count_nonzero(self.weight[:-1], axis=0) == 1)
+
+    @property
+    def wall_within(self) -> Array:
+        """Full actions within which the end of a way is a wall, (W,).
+
+        The highest that a reading came to in the logs may be all that it can show.
+        """
+        most = self.at(np.ones(len(self.weight) - 1))
+        return np.where(self.carries_over, np.minimum(most - 1.0, WALL_TOLD), WALL_GUESSED)
 
     def at(self, normal: Array) -> Array:
         """Full actions along each of the `ways` that are free, (..., W), where (..., D) is seen."""
@@ -58,6 +97,8 @@ def learn_free_ways(
     observations: list[Array],
     shifts: list[Array],
     unit_actions: list[NDArray[np.float32]],
+    low: Array,
+    scale: Array,
 ) -> FreeWays:
     """Fit free ways to what was seen.
 
@@ -66,6 +107,8 @@ def learn_free_ways(
         observations: (T+1, D) each, without missing readings.
         shifts: how far each step went, in full actions, (T, A) each.
         unit_actions: (T, A) each, in [0, 1].
+        low: what each reading's 0 stands for, in its own unit, (D,).
+        scale: by how much its 1 is more, (D,).
     """
     position, seen = np.concatenate(tracks), np.concatenate(observations)
     chosen = np.linspace(0, len(seen) - 1, min(NUM_SIGHTS, len(seen))).astype(np.int64)
@@ -74,7 +117,74 @@ def learn_free_ways(
     penalty = RIDGE * len(chosen) * np.eye(inputs.shape[1])
     penalty[-1, -1] = 0.0
     weight = np.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ free)
+    reading, fall = readings_ahead(tracks, observations, scale)
+    (told,) = np.nonzero(reading >= 0)
+    ahead = reading[told]
+    weight[:, told] = 0.0
+    weight[ahead, told] = 1.0 / fall[told]
+    # What touches a wall reads the same on all sides; a log may not have touched one on each.
+    weight[-1, told] = (low[ahead] - low[ahead].min(initial=np.inf)) / (scale[ahead] * fall[told])
     return FreeWays(weight, _change_when_stopped(observations, shifts, unit_actions))
+
+
+def readings_ahead(
+    tracks: list[Array], observations: list[Array], scale: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Find the reading that tells how far each way goes on.
+
+    Args:
+        tracks: where each step was, in full actions, (T+1, A) for each log.
+        observations: (T+1, D) each, without missing readings.
+        scale: of each reading's unit, in its own, (D,).
+
+    Returns:
+        Its index, (W,), -1 if there is none; and by how much it falls in a full action along the
+        way, (W,).
+    """
+    moved, changed = _moves(tracks, observations)
+    along = ways(moved.shape[1])
+    fall = np.stack([_fall(moved, changed, way) for way in along])
+    # Along its own way a reading falls by what a full action is in its unit; one that points past
+    # it, by more. A slanted way's full action is made of those along the axes.
+    own = np.where(fall > 0, fall * scale, np.inf)
+    is_axis = np.count_nonzero(along, axis=1) == 1
+    unit = np.array([own[is_axis & (along[:, a] != 0)].min() for a in range(along.shape[1])])
+    made_of = np.multiply(along, unit, where=along != 0, out=np.zeros_like(along))
+    expected = np.linalg.norm(made_of, axis=1, keepdims=True)
+    is_known = np.isfinite(own) & np.isfinite(expected)
+    share = np.divide(own, expected, where=is_known, out=np.full(own.shape, np.inf))
+    off = np.abs(np.log(share))
+    reading = np.where(off.min(1) <= SLANT, off.argmin(1), -1)
+    return reading, fall[np.arange(len(along)), reading]
+
+
+def _moves(tracks: list[Array], observations: list[Array]) -> tuple[Array, Array]:
+    """Moves of some steps (M, A), and by how much they changed the readings, (M, D)."""
+    moved, changed = [], []
+    for track, seen in zip(tracks, observations, strict=True):
+        for steps in range(1, MOST_STEPS + 1):
+            move = track[steps:] - track[:-steps]
+            length = np.linalg.norm(move, axis=1)
+            is_long = (length >= LEAST_MOVE) & (length <= MOST_MOVE)
+            moved.append(move[is_long])
+            changed.append((seen[steps:] - seen[:-steps])[is_long])
+    return np.concatenate(moved), np.concatenate(changed)
+
+
+def _fall(moved: Array, changed: Array, way: Array) -> Array:
+    """By how much each reading falls in a full action along a way, (D,); 0 if it doesn't tell."""
+    length = np.linalg.norm(moved, axis=1)
+    is_along = moved @ way >= COURSE * length
+    each = -changed[is_along] / length[is_along, None]
+    usual = np.zeros(changed.shape[1])
+    for reading, fall in enumerate(each.T):
+        does_change = fall != 0
+        if does_change.sum() >= FEWEST_MOVES:
+            usual[reading] = max(0.0, float(np.median(fall[does_change])))
+    if not usual.any():
+        return usual
+    alike = np.where(usual > 0, (np.abs(each - usual) <= ALIKE * usual).mean(0), 0.0)
+    return np.where(alike >= max(LEAST_ALIKE, NEARLY * alike.max()), usual, 0.0)
 
 
 def _gone_over(position: Array, chosen: NDArray[np.int64]) -> Array:

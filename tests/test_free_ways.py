@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from rfl_torch.free_ways import LONGEST, learn_free_ways, ways
+from rfl_torch.free_ways import FEWEST_MOVES, LONGEST, learn_free_ways, readings_ahead, ways
 
 SIZE = np.array([40.0, 20.0])
 
@@ -19,8 +19,25 @@ def walk(num_steps=20000, noise=0.0, end=SIZE[0]):
     return track, seen, np.diff(track, axis=0), ((actions + 1) / 2).astype(np.float32)
 
 
-def learn(*walked):
-    return learn_free_ways(*([part] for part in walked))
+def learn(*walked, low=0.0, scale=1.0):
+    """With readings whose 0 and 1 stand for `low` and `low + scale` in their own unit."""
+    of_each = np.ones(walked[1].shape[1])
+    return learn_free_ways(*([part] for part in walked), low * of_each, scale * of_each)
+
+
+def way_along(*direction):
+    (way,) = np.flatnonzero(np.isclose(ways(2) @ direction, np.linalg.norm(direction)))
+    return way
+
+
+def rays(track, num=8, size=SIZE):
+    """Distances to the walls of a room from places (T, 2), in `num` directions, (T, num)."""
+    angle = 2 * np.pi * np.arange(num) / num
+    ray = np.stack([np.cos(angle), np.sin(angle)], 1)
+    ray[np.abs(ray) < 1e-9] = 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.where(ray > 0, size - track[:, None], -track[:, None]) / ray
+    return np.where(ray == 0, np.inf, away).min(2)
 
 
 def test_ways_along_the_axes_are_free_up_to_the_walls():
@@ -31,9 +48,7 @@ def test_ways_along_the_axes_are_free_up_to_the_walls():
         for sign in (-1, 1):
             (way,) = np.flatnonzero(ways(2)[:, axis] == sign)
             wall = SIZE[axis] - track[:500, axis] if sign > 0 else track[:500, axis]
-            # WIDTH beyond the track counts as gone over, and its edges were not gone along.
-            assert np.median(np.abs(free[:, way] - wall)) < 3
-            assert np.corrcoef(free[:, way], wall)[0, 1] > 0.95
+            np.testing.assert_allclose(free[:, way], wall, atol=1e-6)
 
 
 def test_free_ways_are_known_where_the_log_did_not_go():
@@ -43,6 +58,52 @@ def test_free_ways_are_known_where_the_log_did_not_go():
     beyond = seen[seen[:, 0] * LONGEST > 30]
     free = np.array([learned.at(each)[up] for each in beyond])
     assert np.median(np.abs(free - beyond[:, 3] * LONGEST)) < 3
+
+
+@pytest.mark.parametrize("num_rays", [8, 24])
+def test_the_ray_along_each_way_tells_how_far_it_goes_on(num_rays):
+    track, _, shift, actions = walk()
+    seen = rays(track, num_rays)
+    scale = seen.max(0)
+    learned = learn(track, seen / scale, shift, actions, scale=scale)
+    assert learned.carries_over.all()
+    other = np.array([[100.0, 300.0], [7.0, 45.0]])  # in a room that is much larger
+    size = np.array([400.0, 500.0])
+    for way, along in enumerate(ways(2)):
+        ahead = int(np.round(np.arctan2(along[1], along[0]) / (2 * np.pi) * num_rays)) % num_rays
+        # A tenth: by how much the falls in moves up to 0.1 off the way are spread.
+        truth = np.minimum(rays(other, num_rays, size)[:, ahead], LONGEST)
+        got = learned.at(rays(other, num_rays, size) / scale)[:, way]
+        np.testing.assert_allclose(got, truth, rtol=0.1)
+
+
+def test_in_a_corridor_the_ray_ahead_is_told_from_those_that_fall_as_evenly():
+    """All rays to one wall fall by the same share of what they read at most."""
+    track, _, _, _ = walk(end=3.0)
+    size = np.array([3.0, 2000.0])
+    seen = rays(track, 24, size)
+    towards = [way_along(1, 0), way_along(-1, 0)]
+    reading, fall = readings_ahead([track], [seen / seen.max(0)], seen.max(0))
+    assert reading[towards].tolist() == [0, 12]
+    np.testing.assert_allclose(fall[towards] * seen.max(0)[[0, 12]], 1.0, rtol=1e-6)
+
+
+def test_a_way_that_no_reading_points_along_is_told_by_all():
+    learned = learn(*walk())  # it reads along the axes only
+    is_axis = (ways(2) == 0).any(1)
+    assert learned.carries_over[is_axis].all()
+    assert not learned.carries_over[~is_axis].any()
+    track, seen, shift, actions = walk(num_steps=FEWEST_MOVES)
+    assert not learn(track, seen, shift, actions).carries_over.any()
+
+
+def test_a_wall_that_was_not_touched_is_where_another_touched():
+    """The log never went to the end of the room; there the reading's 0 stands for more than 0."""
+    track, seen, shift, actions = walk(end=25.0)
+    low = seen.min(0)
+    learned = learn(track, seen - low, shift, actions, low=low)
+    free = learned.at(seen[:500] - low)[:, way_along(1, 0)]
+    np.testing.assert_allclose(free, SIZE[0] - track[:500, 0], atol=1e-6)
 
 
 def mean_change(noise):
@@ -66,5 +127,7 @@ def test_in_an_open_room_the_change_of_readings_in_short_steps_is_their_noise(no
     seen_before, seen_after = seen[:-1][free], seen[1:][free]
     pairs = [np.stack(both) for both in zip(seen_before, seen_after, strict=True)]
     tracks = [track[[k, k + 1]] for k in free]
-    learned = learn_free_ways(tracks, pairs, list(shift[free, None]), list(actions[free, None]))
+    units = (np.zeros(4), np.ones(4))
+    moves = (list(shift[free, None]), list(actions[free, None]))
+    learned = learn_free_ways(tracks, pairs, *moves, *units)
     assert learned.still == pytest.approx(mean_change(noise), rel=0.3, abs=2e-3)
