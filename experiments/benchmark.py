@@ -22,13 +22,16 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 from unittest import mock
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
 
+import sims
 from experiments import cli
 from experiments.reach import Reach, benchmark_reach
-from rfl_torch import Agent, AgentConfig, Trajectory, distributed, inference, learning
+from experiments.scoring import maze_layout
+from rfl_torch import Agent, AgentConfig, Trajectory, distributed, inference, learning, record
 from rfl_torch.hmm import GridHMM, Statistics
 from rfl_torch.planner import largest_component
 
@@ -55,7 +58,7 @@ class Em:
 
 @dataclass(frozen=True)
 class Online:
-    """Acting on a map that is laid out, not learned: a step of the filter, and `Executor.act`."""
+    """A step of the filter and `Executor.act` on maps that are laid out, and `act` in the maze."""
 
     cores: int = 1
     """Processor cores to use."""
@@ -63,6 +66,8 @@ class Online:
     """Control steps to time."""
     sides: tuple[int, ...] = (20, 100)
     """Sides of the square grids: 400 and 10,000 nodes."""
+    maze_steps: int = 20_000
+    """Steps of the log, held 3, that the maze's map is learned from."""
     seed: int = 0
     """Seed of the data."""
 
@@ -515,7 +520,31 @@ def benchmark_online(config: Online) -> None:
             ("Executor.act", act_times(agent, config.num_steps, config.seed)),
         ):
             rows.append([f"{name}, N = {side**2}", *microseconds(seconds)])
+    agent, seconds = maze_times(config)
+    rows.append([f"the same put down anywhere, N = {agent.num_nodes}", *microseconds(seconds)])
     print(cli.table(["one control step", "median us", "99 % us"], rows))
+
+
+def maze_times(config: Online) -> tuple[Agent, list[float]]:
+    """The agent, and seconds of each `Executor.act` of robots that don't know where they are."""
+    rng, seconds = np.random.default_rng(config.seed), []
+    gym.register_envs(sims)
+    with gym.make("rfl/RangefinderMaze-v0", layout="paper") as env:
+        agent = Agent(AgentConfig(), config.seed).fit(
+            record(env, config.maze_steps, 3, config.seed)
+        )
+        room = maze_layout(env)
+        executor = None
+        for _ in range(config.num_steps):
+            if executor is None or executor.status != "running":
+                place = room.random_free_position(rng)
+                observation, _ = env.reset(options={"position": place})
+                executor = agent.executor(int(rng.integers(agent.num_nodes)))
+            begin = clock()
+            action = executor.act(observation)
+            seconds.append(clock() - begin)
+            observation, *_ = env.step(action)
+    return agent, seconds
 
 
 def make_agent(side: int, num_steps: int, seed: int) -> Agent:

@@ -70,10 +70,11 @@ def test_an_installed_library_runs_on_the_same_arrays(name):
 
 
 def test_online_times_a_step_of_an_agent_that_keeps_all_its_nodes(capsys):
-    benchmark.main(benchmark.Online(num_steps=300, sides=(4,)))
+    benchmark.main(benchmark.Online(num_steps=300, sides=(4,), maze_steps=500))
     out = capsys.readouterr().out
     assert "filter step, N = 16" in out
     assert "Executor.act, N = 16" in out
+    assert "the same put down anywhere, N = " in out
 
 
 def test_fleet_times_a_job_of_one_without_torchrun(monkeypatch, capsys):
