@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from rfl_torch.free_ways import FEWEST_MOVES, LONGEST, learn_free_ways, readings_ahead, ways
+from rfl_torch.free_ways import (
+    FEWEST_MOVES,
+    LONGEST,
+    WALL_GUESSED,
+    WALL_TOLD,
+    FreeWays,
+    learn_free_ways,
+    readings_ahead,
+    ways,
+)
 
 SIZE = np.array([40.0, 20.0])
 
@@ -104,6 +113,14 @@ def test_a_wall_that_was_not_touched_is_where_another_touched():
     learned = learn(track, seen - low, shift, actions, low=low)
     free = learned.at(seen[:500] - low)[:, way_along(1, 0)]
     np.testing.assert_allclose(free, SIZE[0] - track[:500, 0], atol=1e-6)
+
+
+def test_the_end_of_a_way_is_no_wall_where_a_sensor_sees_no_farther():
+    def within(weight):
+        return FreeWays(np.concatenate([weight, np.zeros((1, 2))]), 0.0).wall_within
+
+    np.testing.assert_allclose(within(np.diag([12.0, 48.0])), [11.0, WALL_TOLD])
+    np.testing.assert_allclose(within(np.full((2, 2), 48.0)), WALL_GUESSED)
 
 
 def mean_change(noise):
