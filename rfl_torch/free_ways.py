@@ -110,21 +110,27 @@ def learn_free_ways(
         low: what each reading's 0 stands for, in its own unit, (D,).
         scale: by how much its 1 is more, (D,).
     """
-    position, seen = np.concatenate(tracks), np.concatenate(observations)
-    chosen = np.linspace(0, len(seen) - 1, min(NUM_SIGHTS, len(seen))).astype(np.int64)
-    free = _gone_over(position, chosen)
-    inputs = np.concatenate([seen[chosen], np.ones((len(chosen), 1))], 1)
-    penalty = RIDGE * len(chosen) * np.eye(inputs.shape[1])
-    penalty[-1, -1] = 0.0
-    weight = np.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ free)
     reading, fall = readings_ahead(tracks, observations, scale)
+    weight = np.zeros((len(scale) + 1, len(reading)))
     (told,) = np.nonzero(reading >= 0)
     ahead = reading[told]
-    weight[:, told] = 0.0
     weight[ahead, told] = 1.0 / fall[told]
     # What touches a wall reads the same on all sides; a log may not have touched one on each.
     weight[-1, told] = (low[ahead] - low[ahead].min(initial=np.inf)) / (scale[ahead] * fall[told])
+    (guessed,) = np.nonzero(reading < 0)
+    if guessed.size:
+        weight[:, guessed] = _fit(np.concatenate(tracks), np.concatenate(observations), guessed)
     return FreeWays(weight, _change_when_stopped(observations, shifts, unit_actions))
+
+
+def _fit(position: Array, seen: Array, chosen_ways: NDArray[np.int64]) -> Array:
+    """The linear function of all readings for some of the ways (C,), (D + 1, C)."""
+    chosen = np.linspace(0, len(seen) - 1, min(NUM_SIGHTS, len(seen))).astype(np.int64)
+    free = _gone_over(position, chosen, ways(position.shape[1])[chosen_ways])
+    inputs = np.concatenate([seen[chosen], np.ones((len(chosen), 1))], 1)
+    penalty = RIDGE * len(chosen) * np.eye(inputs.shape[1])
+    penalty[-1, -1] = 0.0
+    return np.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ free)
 
 
 def readings_ahead(
@@ -187,9 +193,9 @@ def _fall(moved: Array, changed: Array, way: Array) -> Array:
     return np.where(alike >= max(LEAST_ALIKE, NEARLY * alike.max()), usual, 0.0)
 
 
-def _gone_over(position: Array, chosen: NDArray[np.int64]) -> Array:
-    """Full actions along each way from the chosen steps (C,) that the track covers, (C, W)."""
-    tree, along = cKDTree(position), ways(position.shape[1])
+def _gone_over(position: Array, chosen: NDArray[np.int64], along: Array) -> Array:
+    """Full actions along ways (W, A) from the chosen steps (C,) that the track covers, (C, W)."""
+    tree = cKDTree(position)
     free = np.full((len(chosen), len(along)), float(LONGEST))
     start, way = (own.ravel() for own in np.indices(free.shape))
     for reach in range(1, LONGEST + 1):

@@ -106,6 +106,21 @@ def test_a_way_that_no_reading_points_along_is_told_by_all():
     assert not learn(track, seen, shift, actions).carries_over.any()
 
 
+def test_where_no_reading_falls_evenly_all_together_tell_how_far_ways_go_on():
+    track, seen, shift, actions = walk()
+    seen = seen**2  # differences of two of them are even again
+    learned = learn(track, seen, shift, actions)
+    for axis in range(2):
+        for sign in (-1, 1):
+            (way,) = np.flatnonzero(ways(2)[:, axis] == sign)
+            assert not learned.carries_over[way]
+            free = learned.at(seen[:500])[:, way]
+            wall = SIZE[axis] - track[:500, axis] if sign > 0 else track[:500, axis]
+            # WIDTH beyond the track counts as gone over, and its edges were not gone along.
+            assert np.median(np.abs(free - wall)) < 3
+            assert np.corrcoef(free, wall)[0, 1] > 0.95
+
+
 def test_a_wall_that_was_not_touched_is_where_another_touched():
     """The log never went to the end of the room; there the reading's 0 stands for more than 0."""
     track, seen, shift, actions = walk(end=25.0)
