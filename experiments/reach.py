@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -31,6 +31,7 @@ import sims
 from experiments import cli, figures, scoring
 from experiments.on_the_way import Learner, Watched
 from experiments.scoring import MAZE, PLACE_TOLERANCE, Share, Task, wilson
+from experiments.tour import Tour
 from rfl_torch import (
     Agent,
     AgentConfig,
@@ -55,10 +56,31 @@ PEER_NEAR = 0.03
 about a full step."""
 
 
+Contestant = Literal[
+    "random-walk",
+    "best-by-sight",
+    "paper",
+    "held-1",
+    "held-3",
+    "knows-walls",
+    "learning",
+    "held-10",
+    "practice",
+    "strategies",
+    "oracle",
+    "logs-20",
+    "sac",
+]
+
+
 @dataclass(frozen=True)
 class Reach:
     """Going to places: the paper's configuration, the default, practice, and peers."""
 
+    contestants: tuple[Contestant, ...] = get_args(Contestant)
+    """Who takes part: the paper's configuration; the default on actions held 1, 3 and 10, that
+    held 3 in 20 logs, or learning from its tasks; with practice by the default strategy, or by the
+    others; nodes that are true places; peers."""
     layouts: tuple[str, ...] = tuple(sims.layouts.built_in_layouts())
     """Built-in names or JSON files."""
     seeds: int = 5
@@ -68,9 +90,7 @@ class Reach:
     num_steps: int = 10_000
     """Steps of a log; the one held 3 is twice as long."""
     practice: int = 20_000
-    """Steps of practice; 0 leaves it out."""
-    strategies: bool = True
-    """Practise by each goal strategy, not by the default one alone."""
+    """Steps of practice."""
     peer_steps: tuple[int, ...] = (10_000, 30_000, 100_000)
     """Environment steps of the peer; it needs the extra `reach`."""
     sensor_noise: float = 0.0
@@ -95,7 +115,7 @@ class Row(NamedTuple):
     """Environment steps that it learned from."""
     seconds: float
     """Seconds of learning, steps included."""
-    places: Share
+    places: Share | None = None
     """True success on place goals."""
     nodes: Share | None = None
     """True success on node goals, one after the other; None without a map."""
@@ -111,17 +131,16 @@ class Row(NamedTuple):
 
 def benchmark_reach(config: Reach) -> None:
     """Run all contestants, print the table, write results.json and the plot."""
-    for name in ("seeds", "trials", "num_steps"):
+    for name in ("seeds", "trials", "num_steps", "practice"):
         cli.check_count(name, getattr(config, name))
-    if config.practice:
-        cli.check_count("practice", config.practice)
-    has_peer = importlib.util.find_spec("stable_baselines3") is not None
-    if config.peer_steps and not has_peer:
+    names = set(config.contestants)
+    if "sac" in names and importlib.util.find_spec("stable_baselines3") is None:
         print("SAC with HER left out: pip install 'rfl-torch[reach]'")
+        names.remove("sac")
     rows: list[Row] = []
     runs = [(layout, config.seed + k) for layout in config.layouts for k in range(config.seeds)]
     for layout, seed in (bar := tqdm(runs, unit="log")):
-        for row in _contest(config, layout, seed, has_peer):
+        for row in _contest(config, layout, seed, names):
             rows.append(row)
             bar.set_postfix(layout=layout, seed=seed, done=row.name, refresh=True)
             _keep(config, rows)
@@ -138,42 +157,56 @@ def _make(config: Reach, layout: str) -> gym.Env:
     )
 
 
-def _contest(config: Reach, layout: str, seed: int, has_peer: bool) -> Iterator[Row]:
-    """All contestants on one layout and seed."""
+def _contest(config: Reach, layout: str, seed: int, names: set[Contestant]) -> Iterator[Row]:
+    """All of those contestants on one layout and seed."""
     with _make(config, layout) as env:
         judge = Judge(env, layout, seed, config.trials)
-        yield judge.random_walk()
-        if not config.sensor_noise:
+        if "random-walk" in names:
+            yield judge.random_walk()
+        if "best-by-sight" in names and not config.sensor_noise:
             yield judge.best_by_sight()
-        for name, times, hold, choices in (
-            ("paper", 1, 1, AgentConfig.paper()),
-            ("default, independent actions", 1, 1, AgentConfig()),
-            ("default, held 3", 2, 3, AgentConfig()),
-            ("default, held 10", 1, 10, AgentConfig()),
-        ):
-            log = record(env, times * config.num_steps, hold, seed)
-            agent, row = _learn(judge, name, choices, [log], seed)
-            yield row
-            if hold == 3:
-                yield from judge.score_on_the_way(f"{name}, learning from tasks", agent, log)
-        scattered = gym.wrappers.TimeLimit(Anywhere(env, seed), config.num_steps // 10)
-        logs = record_episodes(scattered, 2 * config.num_steps, 3, seed)
-        yield _learn(judge, "default, held 3, 20 logs", AgentConfig(), logs, seed)[1]
-        oracle = know_places(agent, log, seed)
-        yield judge.score("oracle map, held 10", oracle, [log], 0.0)
-        strategies = get_args(Strategy) if config.strategies else ("frontier",)
-        for strategy in strategies if config.practice else ():
-            yield from _practise(config, judge, env, agent, log, strategy, seed)
-        if has_peer and seed < config.seed + config.peer_seeds:
+        if "paper" in names:
+            log = record(env, config.num_steps, 1, seed)
+            yield judge.score("paper", *_learn(AgentConfig.paper(), [log], seed))
+        if "held-1" in names:
+            log = record(env, config.num_steps, 1, seed)
+            yield judge.score("default, independent actions", *_learn(AgentConfig(), [log], seed))
+        if names & {"held-3", "knows-walls", "learning"}:
+            log = record(env, 2 * config.num_steps, 3, seed)
+            learned = agent, _, _ = _learn(AgentConfig(), [log], seed)
+            if "held-3" in names:
+                yield judge.score("default, held 3", *learned)
+            if "knows-walls" in names:
+                yield judge.who_knows_the_walls("knows the walls, not the log held 3", agent, log)
+            if "learning" in names:
+                yield from judge.score_on_the_way(
+                    "default, held 3, learning from tasks", agent, log
+                )
+        if names & {"held-10", "practice", "strategies", "oracle"}:
+            log = record(env, config.num_steps, 10, seed)
+            learned = agent, _, _ = _learn(AgentConfig(), [log], seed)
+            if "held-10" in names:
+                yield judge.score("default, held 10", *learned)
+            if "oracle" in names:
+                yield judge.score("oracle map, held 10", know_places(agent, log, seed), [log], 0.0)
+            for strategy in get_args(Strategy):
+                if ("practice" if strategy == "frontier" else "strategies") in names:
+                    yield from _practise(config, judge, env, agent, log, strategy, seed)
+        if "logs-20" in names:
+            scattered = gym.wrappers.TimeLimit(Anywhere(env, seed), config.num_steps // 10)
+            logs = record_episodes(scattered, 2 * config.num_steps, 3, seed)
+            yield judge.score("default, held 3, 20 logs", *_learn(AgentConfig(), logs, seed))
+        if "sac" in names and seed < config.seed + config.peer_seeds:
             yield from _run_peer(config, judge, layout, seed)
 
 
 def _learn(
-    judge: "Judge", name: str, choices: AgentConfig, logs: list[Trajectory], seed: int
-) -> tuple[Agent, Row]:
+    choices: AgentConfig, logs: list[Trajectory], seed: int
+) -> tuple[Agent, list[Trajectory], float]:
+    """Return an agent, its logs, and the seconds that learning took."""
     begin = time.perf_counter()
     agent = Agent(choices, seed).fit(logs)
-    return agent, judge.score(name, agent, logs, time.perf_counter() - begin)
+    return agent, logs, time.perf_counter() - begin
 
 
 class Anywhere(gym.Wrapper):
@@ -304,6 +337,14 @@ class Judge:
         """Let `act(observation, goal) -> action` do the places; near at any time counts."""
         places = _share([self._comes_near(task, act) for task in self.places])
         return Row(name, self._layout, self._seed, num_steps, seconds, places)
+
+    def who_knows_the_walls(self, name: str, agent: Agent, log: Trajectory) -> Row:
+        """The agent's node goals from anywhere, by a search that needs to find out nothing."""
+        assert log.ground_truth is not None
+        _, tasks = self._node_tasks(agent, scoring.node_table(agent, [log], MAZE))
+        tour = Tour(scoring.maze_layout(self._env), log.ground_truth)
+        in_time = _share([tour.steps(task) <= MAZE.limit for task in tasks])
+        return Row(name, self._layout, self._seed, log.num_steps, 0.0, anywhere=in_time)
 
     def best_by_sight(self) -> Row:
         """What nobody surpasses in the mean who knows the room and is told what a place looks like.
@@ -436,6 +477,7 @@ def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     for (layout, name, _), group in groups.items():
         nodes = [row.nodes for row in group if row.nodes is not None]
         anywhere = [row.anywhere for row in group if row.anywhere is not None]
+        places = [row.places for row in group if row.places is not None]
         lines.append(
             [
                 layout,
@@ -444,7 +486,7 @@ def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
                 str(len(group)),
                 str(_pool(nodes)) if nodes else "-",
                 str(_pool(anywhere)) if anywhere else "-",
-                str(_pool([row.places for row in group])),
+                str(_pool(places)) if places else "-",
                 _percent([row.coverage for row in group]),
                 _percent([row.wormholes for row in group]),
                 _percent([row.connected for row in group]),
@@ -478,7 +520,7 @@ def _keep(config: Reach, rows: list[Row]) -> None:
         new.write_text(json.dumps(plain, indent=1) + "\n")
     curves: dict[str, dict[int, list[float]]] = {}
     for row in rows:
-        if row.num_steps:
+        if row.num_steps and row.places is not None:
             points = curves.setdefault(row.name, {})
             points.setdefault(row.num_steps, []).append(row.places.successes / row.places.trials)
     with cli.replacing(config.out / "reach.png") as new:

@@ -119,7 +119,7 @@ class Layout:
         Raises:
             ValueError: if no such place has room for `radius`.
         """
-        places = self._places
+        places = self.places
         reachable = np.flatnonzero(places.region == self._main_region)
         for _ in range(1000):
             jitter = rng.uniform(-0.5, 0.5, 2) * places.pitch
@@ -169,7 +169,8 @@ class Layout:
         return float(self._distances_from(source)[target])
 
     @cached_property
-    def _places(self) -> Places:
+    def places(self) -> Places:
+        """The free places of the room, and the moves between them; in any region."""
         return _free_places(self)
 
     @cached_property
@@ -177,21 +178,21 @@ class Layout:
         """The region of the start, or the largest one; None if nothing is free."""
         if self.start is not None:
             return self._region(np.array(self.start))
-        region = self._places.region
+        region = self.places.region
         return int(np.bincount(region).argmax()) if len(region) else None
 
     @cached_property
     def _distances_from(self) -> Any:
-        graph = self._places.graph
+        graph = self.places.graph
         # Symmetric by construction; 64 sources are enough for the goals of one evaluation.
         return lru_cache(maxsize=64)(lambda source: dijkstra(graph, indices=source))
 
     def _anchor(self, position: Array) -> int | None:
         """Return the nearest place that the robot can reach from `position` straight."""
-        points = self._places.points
+        points = self.places.points
         if not len(points):
             return None
-        for place in self._places.tree.query(position, k=min(16, len(points)))[1].reshape(-1):
+        for place in self.places.tree.query(position, k=min(16, len(points)))[1].reshape(-1):
             # Half of the radius: in a gap as wide as the robot, grid places are a bit too close.
             if self.is_way_free(position, points[place], ROBOT_RADIUS / 2):
                 return int(place)
@@ -199,7 +200,7 @@ class Layout:
 
     def _region(self, position: Array) -> int | None:
         place = self._anchor(position) if self.is_free(position) else None
-        return None if place is None else int(self._places.region[place])
+        return None if place is None else int(self.places.region[place])
 
 
 def load_layout(layout: str | Path) -> Layout:

@@ -1,6 +1,7 @@
 """`experiments.benchmark`: that its tables say what was run, not how fast this machine is."""
 
 import importlib.util
+import json
 import os
 
 import gymnasium as gym
@@ -116,3 +117,16 @@ def test_who_learns_from_tasks_knows_more_after_each_half_and_the_contestant_sta
     assert 2000 < rows[0].num_steps < rows[1].num_steps
     assert [row.anywhere.trials for row in rows] == [3, 3]
     assert agent.num_nodes == num_nodes
+
+
+def test_reach_runs_whom_it_is_asked_for_and_keeps_their_rows(tmp_path, capsys):
+    choices = {"num_steps": 300, "trials": 3, "seeds": 1, "layouts": ("paper",)}
+    names = ("best-by-sight", "held-3", "knows-walls")
+    benchmark.main(reach.Reach(contestants=names, out=tmp_path, **choices))
+    rows = {row["name"]: row for row in json.loads((tmp_path / "results.json").read_text())}
+    assert list(rows) == ["best by sight", "default, held 3", "knows the walls, not the log held 3"]
+    assert rows["default, held 3"]["num_steps"] == 600
+    assert rows["knows the walls, not the log held 3"]["anywhere"]["trials"] == 3
+    assert (tmp_path / "reach.png").stat().st_size > 0
+    table = capsys.readouterr().out
+    assert all(name in table for name in rows)
