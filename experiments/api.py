@@ -20,8 +20,8 @@ in control steps, log-likelihoods in nats.
 """
 
 
-ALSO = ("executor.BeliefExecutor",)
-"""What users hold without naming it: `Agent.executor` makes one."""
+ALSO = ("executor.BeliefExecutor", "spaces.Readings", "spaces.Actions")
+"""What users hold without naming it: `Agent.executor` makes one, agents have the others."""
 
 
 @dataclass(frozen=True)

@@ -562,7 +562,7 @@ def make_agent(side: int, num_steps: int, seed: int) -> Agent:
 
     @torch.no_grad()
     def lay_out(hmm: GridHMM, *_: object) -> list[learning.Progress]:
-        hmm.emission_mean.copy_(torch.from_numpy(agent.normalize(_rays(nodes))))
+        hmm.emission_mean.copy_(torch.from_numpy(agent.readings.normalize(_rays(nodes))))
         hmm.emission_log_scale.fill_(math.log(math.hypot(0.01, 0.25 / side)))
         hmm.transition_logits.zero_()
         return []
@@ -581,7 +581,7 @@ def filter_times(agent: Agent, num_steps: int, seed: int) -> list[float]:
     """Seconds of each step of the filter alone."""
     chain = agent.hmm.chain()
     state, seconds = inference.start_filter(chain), []
-    for observation in agent.normalize(make_log(num_steps, seed).numpy()):
+    for observation in agent.readings.normalize(make_log(num_steps, seed).numpy()):
         begin = clock()
         inference.filter_step(chain, state, observation, 0.01)
         seconds.append(clock() - begin)

@@ -148,7 +148,7 @@ class Drive:
     @property
     def is_lost(self) -> bool:
         """Whether it does not know where it is."""
-        normal = self.agent.normalize(self.observation)
+        normal = self.agent.readings.normalize(self.observation)
         is_strange = self.agent.log_emission(normal).max() < self.agent.least_familiar
         return bool(self.executor.recovering or is_strange or self.executor.belief.max() < UNSURE)
 
@@ -171,7 +171,7 @@ class Drive:
     def _act(self) -> NDArray[np.float32]:
         """Decide what to do now; without a goal, nothing."""
         if self.goal is None:
-            action: NDArray[np.float32] = self.agent.rest_action
+            action: NDArray[np.float32] = self.agent.actions.rest
             self.executor.watch(self.observation, action)
         else:
             action = self.executor.act(self.observation)
@@ -251,7 +251,7 @@ class Watched(gym.Wrapper):
         """What was seen since the last reset, for where the nodes are; None without a truth."""
         if not self._actions or self._truths[0] is None:
             return None
-        low, high = self._drive.agent.action_bounds
+        low, high = self._drive.agent.actions
         return Trajectory(
             np.stack(self._observations),
             np.clip(np.stack(self._actions), low, high),

@@ -313,7 +313,7 @@ def _check(config: Config) -> None:
 def check_fit(agent: Agent, env: gym.Env) -> None:
     """Refuse an environment that the agent has not learned from."""
     shapes = (env.observation_space.shape, action_bounds(env.action_space)[0].shape)
-    needed = (agent.observation_low.shape, agent.rest_action.shape)
+    needed = (agent.readings.low.shape, agent.actions.rest.shape)
     if shapes != needed:
         raise ValueError(
             f"the environment has observations and actions of shapes {shapes}, the agent learned "

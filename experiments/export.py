@@ -82,8 +82,8 @@ def map_graph(agent: Agent, logs: Any = ()) -> nx.DiGraph:
     transition a step, and `seen`, how often the log took them.
     """
     place, is_true = scoring.node_places(agent, list(logs), None)
-    used = np.flatnonzero(agent.observation_scale > 0)
-    mean = agent.raw_readings(agent.hmm.emission_mean.detach().numpy())
+    used = agent.readings.used
+    mean = agent.readings.restore(agent.hmm.emission_mean.detach().numpy())
     graph = nx.DiGraph()
     for node in range(agent.num_nodes):
         readings = {f"reading_{k}": float(v) for k, v in zip(used, mean[node], strict=True)}
@@ -127,12 +127,12 @@ class Control(nn.Module):
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
-        used = np.flatnonzero(agent.observation_scale > 0)
-        low, high = agent.action_bounds
+        used = agent.readings.used
+        low, high = agent.actions
         buffers = {
             "used": used,
-            "observation_low": agent.observation_low[used],
-            "observation_scale": agent.observation_scale[used],
+            "observation_low": agent.readings.low[used],
+            "observation_scale": agent.readings.scale[used],
             "mean": agent.hmm.emission_mean.detach().numpy(),
             "action_low": low,
             "action_high": high,
@@ -159,12 +159,12 @@ def export_controllers(agent: Agent) -> torch.export.ExportedProgram:
     Raises:
         ValueError: if the agent doesn't act by controllers, or torch can't export this kind.
     """
-    if agent.observation_period.any() or agent.motion is not None:
+    if agent.readings.period.any() or agent.motion is not None:
         raise ValueError(
             "this agent chooses actions by looking ahead; there is no network that answers for "
             "it. Leave --controllers out, and let the robot's loop call the agent's executor."
         )
-    observation = torch.zeros(len(agent.observation_low))
+    observation = torch.zeros(len(agent.readings.low))
     try:
         with torch.no_grad():
             return torch.export.export(Control(agent), (observation, torch.tensor(0)))

@@ -246,7 +246,7 @@ def know_places(agent: Agent, log: Trajectory, seed: int) -> Agent:
     """An agent whose nodes are clusters of the log's true positions."""
     assert log.ground_truth is not None
     _, node = kmeans2(log.ground_truth, agent.num_nodes, minit="++", rng=seed)
-    observations = agent.normalize(log.observations)
+    observations = agent.readings.normalize(log.observations)
     oracle = Agent(agent.config, agent.seed)
     oracle.__dict__ |= {name: value for name, value in agent.__dict__.items() if name != "hmm"}
     oracle.hmm = type(agent.hmm)((2, 2), observations.shape[1])

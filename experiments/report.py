@@ -94,7 +94,7 @@ def render(config: Config) -> str:
     model = config.model or _find_model(config.run)
     agent = Agent.load(model)
     logs = [log for source in config.log or _find_logs(model) for log in read_logs(source)]
-    logs = [log for log in logs if log.observations.shape[1] == len(agent.observation_low)]
+    logs = [log for log in logs if log.observations.shape[1] == len(agent.readings.low)]
     results = _read_results(config.run)
     walls, world = _surroundings(results)
     nodes = _recognized(agent, logs)
@@ -192,8 +192,8 @@ def _facts(agent: Agent, logs: list[Trajectory]) -> list[tuple[str, str]]:
         ("nodes", f"{agent.num_nodes} of {int(np.prod(agent.config.shape))}"),
         ("edges that are planned over", str(graph.nnz)),
         ("can go from each to each", f"{100 * connected:.1f} % of the nodes"),
-        ("readings", str(len(agent.observation_low))),
-        ("actions", str(len(agent.rest_action))),
+        ("readings", str(len(agent.readings.low))),
+        ("actions", str(len(agent.actions.rest))),
         ("runs backwards as it runs forwards", "yes" if agent.is_reversible else "no"),
     ]
     if logs:

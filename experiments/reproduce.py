@@ -455,7 +455,7 @@ def attractor(env: gym.Env, run: Run, node: int) -> figures.Attractor:
     arrows = []
     for place in positions:
         observation, _ = env.reset(options={"position": tuple(place)})
-        *_, info = env.step(run.agent.control(run.agent.normalize(observation), node))
+        *_, info = env.step(run.agent.control(run.agent.readings.normalize(observation), node))
         arrows.append(info["ground_truth"] - place)
     return figures.Attractor(centre, np.array(positions), np.array(arrows))
 

@@ -242,7 +242,7 @@ def forecast_ranks(
         num: times that forecasts are made at.
         rng: draws them.
     """
-    observations = agent.normalize(log.observations)
+    observations = agent.readings.normalize(log.observations)
     beliefs = inference.filter_rows(agent.chain, observations)[0][:, agent.chain.cell]
     times = rng.choice(len(observations) - max(ahead), num, replace=False)
     mean = agent.hmm.emission_mean.detach().numpy()
@@ -461,7 +461,7 @@ def run_tasks(
     for index, task in enumerate(tasks):
         if task.start is not None:
             observation, info = _reset(env, world, task.start)
-        start_density = agent.log_emission(agent.normalize(observation)).max()
+        start_density = agent.log_emission(agent.readings.normalize(observation)).max()
         executor = agent.executor(task.goal, seed=seed + index)
         outcome = run_task(env, executor, observation, info, steps)
         if world is None:
@@ -482,7 +482,7 @@ def observed_distance(agent: Agent, observation: NDArray[np.float32], node: int)
     The rms over the readings that there are, each as a share of its range in the log.
     """
     mean = agent.hmm.emission_mean[node].detach().numpy()
-    return float(np.sqrt(np.nanmean((agent.normalize(observation) - mean) ** 2)))
+    return float(np.sqrt(np.nanmean((agent.readings.normalize(observation) - mean) ** 2)))
 
 
 def observed_near(agent: Agent, observation: NDArray[np.float32], node: int) -> bool:
@@ -575,7 +575,7 @@ def observed_walk_share(
         levels: see `InnateController`.
     """
     found = 0
-    innate = InnateController(*agent.action_bounds, hold, levels, seed)
+    innate = InnateController(*agent.actions, hold, levels, seed)
     observation, _ = env.reset(seed=seed)
     is_over = False
     for goal in goals:

@@ -377,10 +377,10 @@ def judge(whole: Path, path: Path) -> str:
     try:
         if path.name.startswith("damaged") and not equal(load_file(whole), load_file(path)):
             return "altered, and read"
-        low, high = agent.action_bounds
+        low, high = agent.actions
         executor = agent.executor(0)
         for value in (0.5, np.nan, 0.1):
-            seen = np.full(len(agent.observation_low), value, np.float32)
+            seen = np.full(len(agent.readings.low), value, np.float32)
             action = executor.act(seen)
             if not ((low <= action) & (action <= high)).all():
                 return f"acts outside of its space: {action}"
@@ -563,7 +563,7 @@ def soak_execution(env: Any, agent: Agent, num_steps: int, seed: int) -> list[Pa
     rng = np.random.default_rng(seed)
     seen, _ = env.reset(seed=seed)
     parts = []
-    low, high = agent.action_bounds
+    low, high = agent.actions
     executor = agent.executor(0, seed=seed)
     for _ in tqdm(range(PARTS), desc="soak", unit="part"):
         begin, goals, worst = time.process_time(), 0, 0.0

@@ -6,7 +6,6 @@ from a fitted agent and leave it unchanged.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ from torch import Tensor
 from rfl_torch import footprint, growth, inference, learning, places, repair
 from rfl_torch.agent_layout import check_state
 from rfl_torch.checkpoint import load_checkpoint, save_checkpoint
-from rfl_torch.circle import find_periods, unwrap_to_circles, wrap_again
 from rfl_torch.config import AgentConfig
 from rfl_torch.contact import Contact, learn_contact
 from rfl_torch.controllers import (
@@ -49,6 +47,7 @@ from rfl_torch.practice import Attempt, PracticeMonitor, Strategy, practice
 from rfl_torch.reckoning import Reckoning, mend
 from rfl_torch.resume import SavedLearning, identity
 from rfl_torch.senses import apart
+from rfl_torch.spaces import Actions, Readings
 from rfl_torch.trajectory import Trajectory
 
 Goal = int | NDArray[np.float32] | Callable[[int], bool]
@@ -106,12 +105,10 @@ class Agent:
     """What the logs say of each node, if the map was rebuilt by looks and places."""
     statistics: Statistics | None
     """What the logs say of each node of a grid, if it was not."""
-    observation_low: NDArray[np.float64]
-    """Of the readings, what counts as 0, (D,)."""
-    observation_scale: NDArray[np.float64]
-    """And how much more counts as 1, (D,); 0 for those that are left out."""
-    observation_period: NDArray[np.float64]
-    """Of those found to wrap, counted in that scale; 0 for the others, (D,)."""
+    readings: Readings
+    """The range that each reading had in the logs."""
+    actions: Actions
+    """The action space that they were made in."""
     look_radius: float
     """Mean absolute difference of normalised observations within which places look the same."""
     samples: Triplets
@@ -173,8 +170,10 @@ class Agent:
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
         self._forget()
-        self._set_spaces(logs)
-        observations = [torch.from_numpy(self.normalize(log.observations)) for log in logs]
+        self._check_logs(logs)
+        self.readings = Readings.of_logs(logs, self.config.unwraps)
+        self.actions = Actions.of_logs(logs)
+        observations = [torch.from_numpy(self.readings.normalize(log.observations)) for log in logs]
         config = self.config
         self.hmm = GridHMM(
             config.shape, observations[0].shape[1], config.radius, config.metric, config.boundary
@@ -191,7 +190,7 @@ class Agent:
             self.record = learning.learn(self.hmm, observations, stages, saved, record)
         learning.prune(self.hmm, observations, power)
         paths = self._recognize_logs(observations)
-        actions = [self.unit_actions(log.actions) for log in logs]
+        actions = [self.actions.to_unit(log.actions) for log in logs]
         seen = self._filled(observations, paths)
         self.look_radius = look_radius(seen, actions)
         track = (
@@ -230,8 +229,8 @@ class Agent:
         """
         self.memory = self.last_seen = None
         self.free_ways = self.contact = self.positions = None
-        observations = [self.normalize(log.observations) for log in logs]
-        actions = [self.unit_actions(log.actions) for log in logs]
+        observations = [self.readings.normalize(log.observations) for log in logs]
+        actions = [self.actions.to_unit(log.actions) for log in logs]
         paths = [torch.from_numpy(path) for path in self._count(nodes, observations)]
         self._prepare_recognition()
         self._learn_controllers([torch.from_numpy(x) for x in observations], actions, paths)
@@ -272,7 +271,7 @@ class Agent:
         if logs:
             belief = np.zeros(self.num_nodes)
             belief[path[-1]] = 1.0
-            self.last_seen = self.normalize(logs[-1].observations[-1]), belief
+            self.last_seen = self.readings.normalize(logs[-1].observations[-1]), belief
         return self
 
     def practice(
@@ -319,13 +318,13 @@ class Agent:
         assert self.memory is not None
         memory, known = self.memory, self.memory.node
         for log in logs:
-            observations = torch.from_numpy(self.normalize(log.observations))
+            observations = torch.from_numpy(self.readings.normalize(log.observations))
             goes_on = memory.ends_with(observations[0].numpy())
             path = torch.zeros(len(observations), dtype=torch.int64)
             if observations.isnan().any():
                 (path,) = self._recognize_logs([observations])
             (filled,) = self._filled([observations], [path])
-            more = join([(path.numpy(), filled, self.unit_actions(log.actions))])
+            more = join([(path.numpy(), filled, self.actions.to_unit(log.actions))])
             memory = memory.plus(more, goes_on)
         memory = self._widen(memory, len(known))
         seen, actions = memory.logs()
@@ -360,19 +359,13 @@ class Agent:
             num_known: steps of it that are not new.
         """
         fresh = memory.observation[num_known:].astype(np.float64)
-        if (
-            not len(fresh) or self.observation_period.any()
-        ):  # who wraps has two columns, of no range
-            return memory
+        if not len(fresh) or self.readings.period.any():
+            return memory  # who wraps has two columns, of no range
         low, high = np.quantile(fresh, (RARE, 1.0 - RARE), axis=0)
         low, high = low.clip(max=0.0), high.clip(min=1.0)
         if not low.any() and (high == 1.0).all():
             return memory
-        used = self.observation_scale > 0
-        begin, scale = self.observation_low.copy(), self.observation_scale.copy()
-        begin[used] += low * scale[used]
-        scale[used] *= high - low
-        self.observation_low, self.observation_scale = begin, scale
+        self.readings = self.readings.widened(low, high)
         observation = ((memory.observation - low) / (high - low)).astype(np.float32)
         memory = memory._replace(observation=observation)
         self.look_radius = look_radius(*memory.logs())
@@ -383,8 +376,8 @@ class Agent:
         parts = [self.samples]
         path = np.empty(0, np.int64)
         for log in logs:
-            observations = self.normalize(log.observations)
-            actions = self.unit_actions(log.actions)
+            observations = self.readings.normalize(log.observations)
+            actions = self.actions.to_unit(log.actions)
             path = self._extend_map(observations, actions)
             known = np.where(np.isnan(observations), self._mean[path], observations)
             samples = (
@@ -457,15 +450,15 @@ class Agent:
 
     def _check_log(self, log: Trajectory) -> None:
         widths = (log.observations.shape[1], log.actions.shape[1])
-        needed = (len(self.observation_low), len(self.action_bounds[0]))
+        needed = (len(self.readings.low), len(self.actions.low))
         if widths != needed:
             raise ValueError(
                 f"the log has (readings, actions) {widths}, needs {needed} as in the log that the "
                 "agent learned from."
             )
 
-    def _set_spaces(self, logs: list[Trajectory]) -> None:
-        """Fix the normalisation: readings and actions are brought to [0, 1]."""
+    def _check_logs(self, logs: list[Trajectory]) -> None:
+        """Refuse logs that nothing can be learned from."""
         if not logs:
             raise ValueError("no log was given; record one first.")
         widths = {(log.observations.shape[1], log.actions.shape[1]) for log in logs}
@@ -485,32 +478,6 @@ class Agent:
             num_steps, obs_dim, action_dim, math.prod(self.config.shape), self.config.horizon
         )
         footprint.check(needed, f"learning from {num_steps} steps of {obs_dim} readings")
-        observations = np.concatenate([log.observations for log in logs])
-        is_missing = np.isnan(observations)
-        low = np.where(is_missing, np.inf, observations).min(0)
-        high = np.where(is_missing, -np.inf, observations).max(0)
-        is_constant = ~(high > low)
-        if is_constant.all():
-            raise ValueError("no reading changes in the log; check the sensors.")
-        if is_constant.any():
-            constant = np.flatnonzero(is_constant).tolist()
-            warnings.warn(
-                f"readings {constant} never change in the log; they say nothing and are left out. "
-                "Check the sensor, if they should.",
-                stacklevel=3,
-            )
-            low, high = np.where(is_constant, [[0.0], [0.0]], [low, high])
-        self.observation_low, self.observation_scale = _unit_range(low, high)
-        self.observation_period = np.zeros(len(low))
-        if self.config.unwraps:
-            used = ~is_constant
-            raw = [log.observations[:, used].astype(np.float64) for log in logs]
-            self.observation_period[used] = find_periods(raw) / self.observation_scale[used]
-        bounds = [log.bounds for log in logs]
-        self.action_bounds = (
-            np.min([low for low, _ in bounds], 0),
-            np.max([high for _, high in bounds], 0),
-        )
 
     def _recognize_logs(self, observations: list[Tensor]) -> list[Tensor]:
         """Most likely paths under the map as it is now."""
@@ -549,7 +516,9 @@ class Agent:
         if actions[0].shape[1] > MOST_DIMENSIONS:
             return
         self.positions = places.middles(node, positions, self.num_nodes)
-        self.free_ways = learn_free_ways(positions, seen, shifts, actions, *self._own_units())
+        self.free_ways = learn_free_ways(
+            positions, seen, shifts, actions, *self.readings.own_units()
+        )
         self.contact = learn_contact(seen, shifts, actions)
 
     def _repair(
@@ -754,58 +723,18 @@ class Agent:
         return np.asarray(self.edges.sum(1)).ravel()
 
     @property
-    def rest_action(self) -> NDArray[np.float32]:
-        """The middle of the action space, (A,)."""
-        low, high = self.action_bounds
-        return ((low + high) / 2).astype(np.float32)
-
-    @property
     def motion(self) -> Motion | None:
         """What choices lead to; None where the agent acts by its map and controllers alone."""
         if self._motion is None and self.memory is not None and not self.is_reversible:
             self._motion = Motion(self.memory)
         return self._motion
 
-    def normalize(self, observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Bring raw readings (..., D) to the range [0, 1] that the log had, (..., E).
-
-        Readings that never changed in the log are left out; one found to wrap becomes two.
-        """
-        values = np.asarray(observations, np.float64)
-        if values.shape[-1:] != self.observation_low.shape:
-            raise ValueError(
-                f"observation has shape {values.shape}, needs (..., {len(self.observation_low)}) "
-                "as in the log that the agent learned from."
-            )
-        (used,) = np.nonzero(self.observation_scale > 0)
-        kept = np.take(values, used, axis=-1)
-        kept = (kept - self.observation_low[used]) / self.observation_scale[used]
-        period = self.observation_period[used]
-        return unwrap_to_circles(kept, period) if period.any() else kept
-
-    def _own_units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What 0 and 1 of each normalised reading stand for: the lowest, and the range, (E,) each.
-
-        A reading laid on a circle has no unit but its own.
-        """
-        (used,) = np.nonzero(self.observation_scale > 0)
-        plain = used[self.observation_period[used] == 0]
-        low, scale = self.observation_low[plain], self.observation_scale[plain]
-        num_laid = 2 * (len(used) - len(plain))
-        return np.append(low, np.zeros(num_laid)), np.append(scale, np.ones(num_laid))
-
-    def raw_readings(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Undo `normalize`: the readings that changed in the log, in the robot's units."""
-        (used,) = np.nonzero(self.observation_scale > 0)
-        readings = wrap_again(normal, self.observation_period[used])
-        return readings * self.observation_scale[used] + self.observation_low[used]
-
     def recognize(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
         """The node at each step of a sequence (T, D), by Viterbi (section 2.3); int64 (T,).
 
         What the map was laid out from is where the track has it.
         """
-        normal = self.normalize(observations)
+        normal = self.readings.normalize(observations)
         known = np.full(len(normal), -1)
         if self.memory is not None and self.has_track:
             known = self.memory.remember(normal)
@@ -827,7 +756,7 @@ class Agent:
         """
         if isinstance(goal, int | np.integer) or callable(goal):
             return make_executor(self, self._goal_nodes(goal), seed)
-        sight = self.normalize(np.asarray(goal))
+        sight = self.readings.normalize(np.asarray(goal))
         homing = Homing(self, sight, self._places_like(sight))
         executor = make_executor(self, homing.nodes, seed, homing)
         if self.strangeness(sight, int(homing.nodes[0])) > STRANGE_GOAL:
@@ -850,7 +779,7 @@ class Agent:
         if sight.ndim != 1 or np.isnan(sight).all():
             raise ValueError(
                 f"goal has shape {sight.shape}; needs one observation "
-                f"({len(self.observation_low)},) with at least one reading."
+                f"({len(self.readings.low)},) with at least one reading."
             )
         if self.memory is not None and self.positions is not None:
             seen, node = self.memory.observation, self.memory.node
@@ -876,7 +805,7 @@ class Agent:
             raise ValueError("the logs show no free ways: their actions don't add up to positions.")
         gap = WIDE if node is None else FINE
         explorer = Explorer(
-            *self.action_bounds, self.look_radius, self.free_ways, self.contact, seed, gap
+            *self.actions, self.look_radius, self.free_ways, self.contact, seed, gap
         )
         if node is not None:
             explorer.know(self.positions - self.positions[node])
@@ -913,20 +842,20 @@ class Agent:
 
     def control(self, normal: NDArray[np.float64], node: int) -> NDArray[np.float32]:
         """f_j(o_t, mu_j): the action by which node j's controller heads for the node, (A,)."""
-        return self._raw_action(self._unit_control(normal, node))
+        return self.actions.of_unit(self._unit_control(normal, node))
 
     def control_to_sight(
         self, normal: NDArray[np.float64], node: int, sight: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """The action by which a robot at a node heads for where it sees a sight (D,), (A,)."""
         if self.positions is None:
-            return self._raw_action(self._unit_control(normal, node, sight))
+            return self.actions.of_unit(self._unit_control(normal, node, sight))
         around = self._around(node)
         node = int(around[np.nansum(np.abs(self._mean[around] - normal), 1).argmin()])
         around = self._around(node)
         where, means = self.positions[around], self._mean[around]
         move = move_to_sight(sight - normal, means - self._mean[node], where - self.positions[node])
-        return self.action_of_move(move)
+        return self.actions.of_move(move)
 
     def control_by_reckoning(
         self, normal: NDArray[np.float64], node: int, here: int, where: NDArray[np.float64]
@@ -945,7 +874,7 @@ class Agent:
             for seen in (normal, self._mean[here])
         )
         full = mend(action, asked, self.positions[node] - where)
-        return self.action_of_move(full)
+        return self.actions.of_move(full)
 
     def is_near(self, node: int, other: int) -> bool:
         """Whether one node is in the surroundings of another, or is it."""
@@ -962,31 +891,6 @@ class Agent:
         target = mean if target is None else np.where(np.isnan(target), mean, target)
         row = np.concatenate([observation, target], dtype=np.float32, casting="same_kind")
         return self.bank.at(row, node)
-
-    def action_of_move(self, move: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The action (A,) of a move (A,) in full actions; what is longer is shortened, not bent."""
-        return self._raw_action((move + 1.0) / 2.0)
-
-    def move_of_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """An action (A,) in full ones, in [-1, 1], (A,)."""
-        return 2.0 * self.unit_actions(action).astype(np.float64) - 1.0
-
-    def _raw_action(self, unit: NDArray[np.floating]) -> NDArray[np.float32]:
-        """From [0, 1] to the action space; what lies outside is shortened, not bent.
-
-        A controller that overflows, far from all that it learned from, says nothing: rest.
-        """
-        if not np.isfinite(unit).all():
-            return self.rest_action
-        offset = unit.astype(np.float64) - 0.5
-        offset = offset / max(1.0, 2 * float(np.abs(offset).max()))
-        low, high = self.action_bounds
-        return np.clip(low + (offset + 0.5) * (high - low), low, high).astype(np.float32)
-
-    def unit_actions(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Actions (..., A) in the share of the action space that they are, [0, 1]."""
-        low, high = self.action_bounds
-        return ((actions - low) / np.where(high > low, high - low, 1.0)).astype(np.float32)
 
     # -- keeping ----------------------------------------------------------------------------
 
@@ -1012,11 +916,11 @@ class Agent:
             "look_radius": torch.tensor(self.look_radius, dtype=torch.float64),
             "least_familiar": torch.tensor(self.least_familiar, dtype=torch.float64),
             "is_reversible": torch.tensor(self.is_reversible),
-            "observation_low": torch.from_numpy(self.observation_low),
-            "observation_scale": torch.from_numpy(self.observation_scale),
-            "observation_period": torch.from_numpy(self.observation_period),
-            "action_low": torch.from_numpy(self.action_bounds[0]),
-            "action_high": torch.from_numpy(self.action_bounds[1]),
+            "observation_low": torch.from_numpy(self.readings.low),
+            "observation_scale": torch.from_numpy(self.readings.scale),
+            "observation_period": torch.from_numpy(self.readings.period),
+            "action_low": torch.from_numpy(self.actions.low),
+            "action_high": torch.from_numpy(self.actions.high),
         }
         if self.memory is not None:
             memory = self.memory._asdict()
@@ -1060,10 +964,9 @@ class Agent:
         self.hmm = GridHMM.of_state(
             config.shape, config.radius, config.metric, config.boundary, _with_prefix(state, "hmm.")
         )
-        self.observation_low = state["observation_low"].numpy()
-        self.observation_scale = state["observation_scale"].numpy()
-        self.observation_period = state["observation_period"].numpy()
-        self.action_bounds = (state["action_low"].numpy(), state["action_high"].numpy())
+        ranges = (state[f"observation_{name}"].numpy() for name in Readings._fields)
+        self.readings = Readings(*ranges)
+        self.actions = Actions(state["action_low"].numpy(), state["action_high"].numpy())
         self.look_radius = float(state["look_radius"])
         self.edges = _sparse(state["edges.pair"], state["edges.count"], self.num_nodes)
         self.tried = state["tried"].numpy()
@@ -1107,12 +1010,6 @@ def make_bank(kind: str, num_nodes: int, obs_dim: int, action_dim: int) -> Bank:
         # and softer fits answer with the bias there.
         return SVRBank(num_nodes, 2 * obs_dim, action_dim, bandwidth=1.0, cost=100.0)
     return RBFBank(num_nodes, obs_dim, action_dim)
-
-
-def _unit_range(
-    low: NDArray[np.float32], high: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return low.astype(np.float64), (high - low).astype(np.float64)
 
 
 def _with_prefix(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

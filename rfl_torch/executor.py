@@ -82,7 +82,7 @@ class PathExecutor:
         )
         self._chain = agent.chain
         self._window: deque[NDArray[np.float64]] = deque(maxlen=self._config.window)
-        self._innate = InnateController(*agent.action_bounds, seed=seed)
+        self._innate = InnateController(*agent.actions, seed=seed)
         self._plans = self._stalled = self._babble_left = 0
         self.status: Status = "running"
         self.path: list[int] = []
@@ -96,7 +96,7 @@ class PathExecutor:
         self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
     ) -> None:
         """Follow where the robot is while someone else chooses its actions; see BeliefExecutor."""
-        normal = sensible(self._agent.normalize(observation))
+        normal = sensible(self._agent.readings.normalize(observation))
         self._window.append(normal)
         self._recognize()
         self.is_familiar = self._agent.strangeness(normal, self.node) <= STRANGE
@@ -107,7 +107,7 @@ class PathExecutor:
         if self.status == "running" and not self.path and self._babble_left == 0:
             self._plan()
         if self.status != "running":
-            return self._agent.rest_action
+            return self._agent.actions.rest
         if not self.path:
             self._babble_left -= 1
             return self._innate.act()
@@ -169,7 +169,7 @@ class BeliefExecutor:
         self._goals, self._homing = goals, homing
         self.goal = int(goals[0])
         self._seed = seed
-        self._search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
+        self._search = LookSearch(*agent.actions, agent.look_radius, seed)
         self._explorer: Explorer | None = None
         self._trail: Trail | None = None
         self._last_place: tuple[NDArray[np.float64], NDArray[np.float64], int] | None = None
@@ -257,10 +257,10 @@ class BeliefExecutor:
 
     def _note_action(self, action: NDArray[np.float32] | None) -> None:
         """Remember what was done, in full actions."""
-        self._did = None if action is None else self._agent.move_of_action(action)
+        self._did = None if action is None else self._agent.actions.to_move(action)
 
     def _decide(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        self._sensed = sensible(self._agent.normalize(observation))
+        self._sensed = sensible(self._agent.readings.normalize(observation))
         normal = self._recognize(self._sensed)
         is_lost = self._unfamiliar >= LOST or self._astray > 0 or self._is_exploring
         is_lost = is_lost or self._refuted > 0
@@ -294,7 +294,7 @@ class BeliefExecutor:
                 return self._look_for_a_way()
             self._choose_next()
         if self.status != "running":
-            return self._agent.rest_action
+            return self._agent.actions.rest
         self.recovering = self._babble_left > 0
         if self.recovering:
             self._babble_left -= 1
@@ -304,7 +304,7 @@ class BeliefExecutor:
         where = self._where[self.node]
         if 2 * self._steps_left < self._config.patience and self._next != self.node:
             # A node of few steps taught its controller little: beside it, it may go to and fro.
-            return self._agent.action_of_move(self._reckoning.positions[self._next] - where)
+            return self._agent.actions.of_move(self._reckoning.positions[self._next] - where)
         return self._agent.control_by_reckoning(normal, self._next, self.node, where)
 
     def _search_map(self, normal: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -324,7 +324,7 @@ class BeliefExecutor:
         if self._cut_off > LONGEST_SEARCH:
             self.status = "gave_up"
             self.reason = f"no way is known from here, nor found in {LONGEST_SEARCH} steps"
-            return self._agent.rest_action
+            return self._agent.actions.rest
         positions = self._agent.positions
         if positions is None or self._cut_off not in (1, CONFIRMED):
             return self._explore()
@@ -502,7 +502,7 @@ class BeliefExecutor:
         """
         self._explorer, self._trail, self._refuted = None, None, 0  # they count its own steps
         self._note_action(action)
-        self._recognize(sensible(self._agent.normalize(observation)))
+        self._recognize(sensible(self._agent.readings.normalize(observation)))
 
     def _cheapest_neighbor(self, node: int) -> int:
         """The neighbour over which the goal is cheapest; a node without any is its own."""

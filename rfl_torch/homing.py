@@ -97,7 +97,7 @@ class Homing:
         self.nodes: Labels = self._places[place].nodes
         self._left, self._least, self._since = APPROACH, np.inf, 0
         self._probes: Probes | None = None
-        self._seen, self._did = self._sight, np.zeros(len(self._agent.rest_action))
+        self._seen, self._did = self._sight, np.zeros(len(self._agent.actions.rest))
         self._off = self._did
         """From where it was most like the goal, in full actions, by dead reckoning, (A,)."""
 
@@ -137,9 +137,9 @@ class Homing:
         if step is None:
             action = self._agent.control_to_sight(normal, node, self._sight)
         else:
-            action = self._agent.action_of_move(step)
+            action = self._agent.actions.of_move(step)
         self._seen = normal
-        self._did = self._agent.move_of_action(action)
+        self._did = self._agent.actions.to_move(action)
         return action
 
     def _moved(self, normal: Array) -> Array:

@@ -188,7 +188,7 @@ def practice(
     rng = np.random.default_rng(seed)
     run = _Run(env, num_steps, seed)
     goals = Goals(agent, strategy, rng)
-    search = LookSearch(*agent.action_bounds, agent.look_radius, seed)
+    search = LookSearch(*agent.actions, agent.look_radius, seed)
     history: list[Attempt] = []
     node = 0
     bar = iter(progress(range(num_steps)))
@@ -212,7 +212,7 @@ def practice(
         history.append(attempt)
         _report(monitor, strategy, history, run.done)
         if run.pending >= pace(agent) or run.left == 0:
-            agent.partial_fit(run.take_logs(*agent.action_bounds))
+            agent.partial_fit(run.take_logs(*agent.actions))
             goals.update()
             assert agent.last_seen is not None
             node = int(agent.last_seen[1].argmax())  # it may have another number now
@@ -236,7 +236,7 @@ def _look_around(
     rng: np.random.Generator,
 ) -> None:
     """Do at this place what was not done there, and follow where it leads off the map."""
-    low, high = agent.action_bounds
+    low, high = agent.actions
     unit = directions(len(low))
     left, most = LOOK_AROUND, LOOK_AROUND + OFF_MAP
     node = executor.node
@@ -253,7 +253,7 @@ def _look_around(
                 most -= _explore(agent, run, executor, explorer, min(most, run.left))
                 break
             if choice is None or not executor.is_familiar:
-                action = search.act(agent.normalize(run.observation))
+                action = search.act(agent.readings.normalize(run.observation))
             else:
                 action = (low + unit[choice] * (high - low)).astype(np.float32).clip(low, high)
             run.step(action)
@@ -266,7 +266,7 @@ def _explore(agent: "Agent", run: _Run, executor: Any, explorer: Explorer, most:
     """Walk in unknown land until all that is near is known; returns the steps taken."""
     known = 0
     for step in range(most):
-        action = explorer.act(agent.normalize(run.observation))
+        action = explorer.act(agent.readings.normalize(run.observation))
         run.step(action)
         executor.watch(run.observation, action)
         known = known + 1 if executor.is_familiar else 0

@@ -200,8 +200,8 @@ class SteeringExecutor:
             if self.status == "reached":
                 self._last = self._stay(self._situation)
         if self.status == "gave_up":
-            return self._agent.rest_action
-        low, high = self._agent.action_bounds
+            return self._agent.actions.rest
+        low, high = self._agent.actions
         action = low + self._motion.choices[self._last] * (high - low)
         return np.clip(action, low, high).astype(np.float32)
 
@@ -209,7 +209,7 @@ class SteeringExecutor:
         self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
     ) -> None:
         """Follow where the robot is while someone else chooses its actions; see BeliefExecutor."""
-        normal = self._agent.normalize(observation)
+        normal = self._agent.readings.normalize(observation)
         now = self._recognize(normal)
         self.is_familiar = self._agent.strangeness(now, self.node) <= 1.0
         before, self._before = self._before, now

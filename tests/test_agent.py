@@ -84,7 +84,7 @@ def test_a_goal_that_looks_like_no_known_place_is_given_up_at_once(agent):
     executor, _, actions = drive(agent, np.full(4, 3.0, np.float32), (0.5, 0.5))
     assert executor.status == "gave_up"
     assert "no node looks like the goal" in executor.reason
-    np.testing.assert_array_equal(actions, [agent.rest_action])
+    np.testing.assert_array_equal(actions, [agent.actions.rest])
 
 
 def test_a_log_that_stays_at_one_node_leaves_a_robot_at_rest(log):
@@ -93,7 +93,7 @@ def test_a_log_that_stays_at_one_node_leaves_a_robot_at_rest(log):
     agent = Agent(config).fit(short)
     executor = agent.executor(0)
     assert agent.num_nodes == 1
-    np.testing.assert_array_equal(executor.act(log.observations[0]), agent.rest_action)
+    np.testing.assert_array_equal(executor.act(log.observations[0]), agent.actions.rest)
     assert executor.status == "reached"
 
 
@@ -315,7 +315,7 @@ def test_blame_is_bounded_and_success_takes_it_back(agent, log):
     blamed.graph = agent.graph.copy()
     blamed.map_cost = agent.graph.data.copy()
     mean = agent.hmm.emission_mean.detach().numpy()[-1]
-    still = (mean * agent.observation_scale + agent.observation_low).astype(np.float32)
+    still = (mean * agent.readings.scale + agent.readings.low).astype(np.float32)
     for _ in range(40):  # the robot doesn't move, whatever it is told
         executor = blamed.executor(0)
         for _ in range(400):

@@ -55,7 +55,7 @@ def test_environments_are_driven_by_their_id(tmp_path, capsys, env, readings, ac
     logs, agent = go(tmp_path, env, hold=4)
     assert sum(log.num_steps for log in logs) == 600
     assert logs[0].observations.shape[1] == readings
-    assert agent.rest_action.shape == (actions,)
+    assert agent.actions.rest.shape == (actions,)
     shares(capsys.readouterr().out)
 
 
@@ -139,9 +139,9 @@ def test_spaces_that_do_not_fit_are_refused_with_a_wrapper_that_exists(observati
 def test_the_observed_measure_is_the_rms_over_known_readings_in_their_ranges(tmp_path):
     _, agent = go(tmp_path, "Pendulum-v1")
     mean = agent.hmm.emission_mean[3].detach().numpy()
-    at_node = agent.observation_low + mean * agent.observation_scale
+    at_node = agent.readings.low + mean * agent.readings.scale
     assert scoring.observed_distance(agent, at_node, 3) == pytest.approx(0.0, abs=1e-12)
-    away = at_node + np.array([0.3, 0.0, 0.4]) * agent.observation_scale
+    away = at_node + np.array([0.3, 0.0, 0.4]) * agent.readings.scale
     assert scoring.observed_distance(agent, away, 3) == pytest.approx(0.5 / 3**0.5)
     away[0] = np.nan
     assert scoring.observed_distance(agent, away, 3) == pytest.approx(0.4 / 2**0.5)
@@ -156,7 +156,7 @@ def test_near_is_within_the_nodes_width_for_the_agent_and_the_walk_alike(tmp_pat
     width = ((0.3**2 + 0.1**2 + 0.2**2) / 3) ** 0.5
 
     def seen(node, away):
-        return agent.observation_low + (mean[node] + away) * agent.observation_scale
+        return agent.readings.low + (mean[node] + away) * agent.readings.scale
 
     for node, limit in ((3, width), (4, scoring.OBSERVED_TOLERANCE)):
         assert scoring.observed_near(agent, seen(node, 0.99 * limit), node)
@@ -198,7 +198,7 @@ class Arrived:
 
     def executor(self, goal, seed):
         own = SimpleNamespace(status="reached", goal=goal, node=self._node, path=[], reason="")
-        own.act = lambda observation: self._agent.rest_action
+        own.act = lambda observation: self._agent.actions.rest
         return own
 
 

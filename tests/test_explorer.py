@@ -157,7 +157,7 @@ def test_a_cell_is_new_beyond_a_gap_around_those_that_were_entered(gap):
 
 def test_who_completes_a_map_finds_something_new_nearer_than_who_is_lost():
     log, agent = learned()
-    seen = agent.normalize(log.observations[3000])
+    seen = agent.readings.normalize(log.observations[3000])
     node = int(agent.memory.node[3000])
     lost, fine = agent.explorer(), agent.explorer(node=node)
     lost.know(agent.positions - agent.positions[node])  # all that differs is the gap
@@ -181,7 +181,7 @@ def test_where_controllers_lead_nowhere_a_robot_goes_by_dead_reckoning(monkeypat
         observation, info = env.reset(options={"position": tuple(log.ground_truth[start])})
         agent.last_seen = None
         executor = agent.executor(goal)
-        monkeypatch.setattr(agent, "control_by_reckoning", lambda *_: agent.rest_action)
+        monkeypatch.setattr(agent, "control_by_reckoning", lambda *_: agent.actions.rest)
         for _ in range(500):
             action = executor.act(observation)
             assert not executor.recovering

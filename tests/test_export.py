@@ -69,7 +69,7 @@ def test_both_files_hold_the_planned_graph(agents, log, tmp_path):
         assert values["true_place"]
         np.testing.assert_allclose([values["x"], values["y"]], table.mean[node])
         reading = [values[f"reading_{k}"] for k in range(4)]
-        np.testing.assert_allclose(reading, agent.raw_readings(means[node]), rtol=1e-6)
+        np.testing.assert_allclose(reading, agent.readings.restore(means[node]), rtol=1e-6)
         away.append(np.abs(log.observations[path == node].mean(0) - reading).max())
     assert np.quantile(away, 0.9) < 0.1
     steps = list(zip(path[:-1].tolist(), path[1:].tolist(), strict=True))
@@ -97,7 +97,7 @@ def test_the_exported_controllers_answer_as_the_agent_does(agents, log, tmp_path
         observations = np.insert(observations, 1, 0.5, axis=1)
     observations[5, 0] = np.nan
     for step, node in ((3, 0), (5, 1), (700, agent.num_nodes - 1)):
-        expected = agent.control(agent.normalize(observations[step]), node)
+        expected = agent.control(agent.readings.normalize(observations[step]), node)
         answer = control(torch.from_numpy(observations[step]), torch.tensor(node))
         np.testing.assert_allclose(answer.numpy(), expected, atol=1e-5)
 

@@ -50,7 +50,7 @@ def test_a_turned_ring_is_reported_and_not_believed(agent, log, monkeypatch):
 @pytest.fixture(scope="module")
 def sights(agent):
     """What each node looks like."""
-    return agent.raw_readings(agent.hmm.emission_mean.detach().numpy()).astype(np.float32)
+    return agent.readings.restore(agent.hmm.emission_mean.detach().numpy()).astype(np.float32)
 
 
 def way_beyond(agent, sights, node):
@@ -82,7 +82,7 @@ def test_a_robot_that_was_lost_arrives_only_if_what_lies_beyond_its_goal_looks_r
     assert executor.status == "reached"  # nothing strange was seen before
     executor = agent.executor(7)
     for _ in range(60):
-        executor.act(rng.random(24).astype(np.float32) * agent.observation_scale.max())
+        executor.act(rng.random(24).astype(np.float32) * agent.readings.scale.max())
     assert not executor.is_familiar
     assert stand_and_walk(executor, sights, way) == ("running", "reached")
 
@@ -92,7 +92,7 @@ def test_a_familiar_sight_after_many_strange_ones_is_no_arrival_yet(agent, sight
     rng = np.random.default_rng(0)
     executor = agent.executor(7)
     for _ in range(60):
-        executor.act(rng.random(24).astype(np.float32) * agent.observation_scale.max())
+        executor.act(rng.random(24).astype(np.float32) * agent.readings.scale.max())
     said = []
     for _ in range(12):
         executor.act(sights[7])

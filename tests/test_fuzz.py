@@ -218,7 +218,7 @@ def test_any_log_is_learned_from_or_refused(
 
 
 def acts_within_bounds(agent, observations):
-    low, high = agent.action_bounds
+    low, high = agent.actions
     executor = agent.executor(agent.num_nodes - 1)
     for observation in observations:
         action = executor.act(observation)

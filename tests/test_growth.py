@@ -122,11 +122,11 @@ def test_a_grid_map_learns_more_by_accumulated_statistics():
     agent = Agent(config).fit(dot_log(800, seed=1))
     num_nodes, num_steps = agent.num_nodes, agent.statistics.num_steps
     more = dot_log(700, seed=2)
-    before = agent.hmm.log_likelihood(agent.normalize(more.observations))
+    before = agent.hmm.log_likelihood(agent.readings.normalize(more.observations))
     agent.partial_fit(more)
     assert agent.num_nodes == num_nodes
     assert agent.statistics.num_steps == num_steps + 701
-    assert agent.hmm.log_likelihood(agent.normalize(more.observations)) > before
+    assert agent.hmm.log_likelihood(agent.readings.normalize(more.observations)) > before
 
 
 def test_a_log_of_another_robot_is_refused(half_agent):

@@ -70,11 +70,11 @@ def test_places_are_apart_and_the_likeliest_comes_first(off):
 def homing(*aways):
     """Of an agent whose regression knows no way; looks have radius 1, and a place each."""
     agent = SimpleNamespace(
-        rest_action=np.zeros(2, np.float32),
+        actions=SimpleNamespace(
+            rest=np.zeros(2, np.float32), to_move=np.float64, of_move=np.float32
+        ),
         look_radius=1.0,
         free_ways=None,
-        move_of_action=np.float64,
-        action_of_move=np.float32,
         control_to_sight=lambda normal, node, sight: np.zeros(2, np.float32),
     )
     return Homing(agent, np.zeros(6), [Place(np.array([k]), away) for k, away in enumerate(aways)])
@@ -177,7 +177,7 @@ def test_a_robot_that_is_nearly_there_goes_on_though_what_it_sees_is_strange(lea
     executor.act(1.0 - log.observations[3000])
     assert not executor.is_familiar
     assert len(seen) == 1
-    np.testing.assert_array_equal(seen[0], agent.normalize(1.0 - log.observations[3000]))
+    np.testing.assert_array_equal(seen[0], agent.readings.normalize(1.0 - log.observations[3000]))
 
 
 def test_a_robot_goes_on_from_the_node_to_where_it_sees_just_what_it_was_shown(learned):
@@ -200,7 +200,7 @@ def test_a_robot_goes_on_from_the_node_to_where_it_sees_just_what_it_was_shown(l
                 observation, _, _, _, info = env.step(action)
             assert executor.status == "reached"
             blind = agent.control_to_sight(
-                np.full(24, np.nan), executor.node, agent.normalize(sight)
+                np.full(24, np.nan), executor.node, agent.readings.normalize(sight)
             )
             assert np.isfinite(blind).all()
             off.append(np.linalg.norm(info["ground_truth"] - place))

@@ -192,7 +192,7 @@ def test_an_ended_episode_begins_anew():
     )
     agent = types.SimpleNamespace(
         executor=lambda goal, seed: executor,
-        normalize=lambda observation: observation,
+        readings=types.SimpleNamespace(normalize=lambda observation: observation),
         log_emission=lambda normal: np.zeros(1),
         least_familiar=-1.0,
         num_nodes=1,

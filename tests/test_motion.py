@@ -366,7 +366,7 @@ def test_a_goal_that_nothing_brings_nearer_is_given_up_with_a_reason(agent):
             break
     assert executor.status == "gave_up"
     assert "kicks" in executor.reason
-    np.testing.assert_array_equal(executor.act(np.full(1, 0.5, np.float32)), agent.rest_action)
+    np.testing.assert_array_equal(executor.act(np.full(1, 0.5, np.float32)), agent.actions.rest)
 
 
 def test_several_nodes_are_one_goal_and_the_first_to_come_by_will_do(agent, swings):

@@ -554,7 +554,7 @@ def test_a_room_entered_later_is_not_taken_for_one_that_looks_the_same(late, hal
         step += piece.num_steps
         seen, belief = agent.last_seen
         assert belief.argmax() == agent.memory.node[-1]
-        np.testing.assert_array_equal(seen, agent.normalize(piece.observations[-1]))
+        np.testing.assert_array_equal(seen, agent.readings.normalize(piece.observations[-1]))
     assert len(agent.memory.start) == 1
     assert agent.edges.sum() == walk.log.num_steps
     assert walk.extent(agent.memory.node).max() < 120
@@ -679,7 +679,7 @@ def test_a_goal_is_where_the_log_saw_what_is_most_like_it(late, half_path):
     (walk, _), agent = late, Agent.load(half_path)
     seen = agent.memory.observation
     for step in range(0, len(seen), 97):
-        goals = agent._places_like(agent.normalize(walk.log.observations[step]))[0].nodes
+        goals = agent._places_like(agent.readings.normalize(walk.log.observations[step]))[0].nodes
         assert goals[0] == agent.memory.node[step]
         away = np.abs(seen - seen[step]).mean(1) / agent.look_radius
         assert set(goals) == set(agent.memory.node[away <= 0.1])
@@ -772,7 +772,7 @@ def test_more_data_is_seen_as_if_it_had_been_there_from_the_first(corridor_and_h
     agent.partial_fit(hall)
     assert agent.has_track
     assert agent.num_nodes < 1.1 * whole.num_nodes  # 1.28 times, if ranges stay the corridor's
-    normal = agent.normalize(np.concatenate([log.observations for log in hall]))
+    normal = agent.readings.normalize(np.concatenate([log.observations for log in hall]))
     assert np.quantile(normal, [0.02, 0.98]) == pytest.approx([0.0, 1.0], abs=0.3)
     found = agent.recognize(hall[-1].observations)
     np.testing.assert_array_equal(found, agent.memory.paths()[-1])
@@ -802,11 +802,11 @@ def test_the_origin_is_held_by_what_moves_as_the_first_log_does():
 
 def test_outliers_in_more_data_do_not_change_what_all_else_looks_like(late, half_path):
     (walk, step), agent = late, Agent.load(half_path)
-    scale = agent.observation_scale
+    scale = agent.readings.scale
     log = copy.deepcopy(walk.log)
     log.observations[step::60] *= 100.0
     agent.partial_fit(part(log, step, step + 1000))
-    assert (agent.observation_scale < 1.5 * scale).all()  # what was truly read is 1.42 times wider
+    assert (agent.readings.scale < 1.5 * scale).all()  # what was truly read is 1.42 times wider
 
 
 def test_a_robot_in_a_part_of_the_map_from_which_no_way_is_known_finds_one(tmp_path):

@@ -158,7 +158,7 @@ def test_a_walk_in_unknown_land_goes_on_while_something_new_is_near(away, goes_o
         explorer.cells_to_new = away if explorer.num_steps <= 40 else 0
 
     explorer.act = act
-    agent = SimpleNamespace(normalize=lambda observation: observation)
+    agent = SimpleNamespace(readings=SimpleNamespace(normalize=lambda observation: observation))
     run = SimpleNamespace(observation=None, step=lambda action: None)
     executor = SimpleNamespace(is_familiar=True, watch=lambda *_: None)
     num_steps = _explore(agent, run, executor, explorer, 100)

@@ -58,7 +58,7 @@ class Says:
 def agent_saying(status, after=3):
     return SimpleNamespace(
         executor=lambda goal, seed: Says(status, after),
-        normalize=lambda observation: observation,
+        readings=SimpleNamespace(normalize=lambda observation: observation),
         log_emission=lambda normal: np.zeros(1),
         least_familiar=-1.0,
     )
@@ -349,7 +349,7 @@ def test_forecasts_of_a_models_own_samples_are_as_sure_as_right():
     agent = Agent(dot_config(repairs=False)).fit(dot_log(1500, seed=4))
     generator = torch.Generator().manual_seed(0)
     drawn = agent.hmm.sample(3000, generator).observations.numpy()
-    raw = drawn * agent.observation_scale + agent.observation_low
+    raw = drawn * agent.readings.scale + agent.readings.low
     log = Trajectory(raw.astype(np.float32), np.zeros((2999, 2), np.float32))
     agent.chain = agent.hmm.chain()
     ranks = scoring.forecast_ranks(agent, log, (1, 10), 1000, np.random.default_rng(1))
