@@ -519,7 +519,7 @@ class Agent:
         self.free_ways = learn_free_ways(
             positions, seen, shifts, actions, *self.readings.own_units()
         )
-        self.contact = learn_contact(seen, shifts, actions)
+        self.contact = learn_contact(seen, shifts, actions).completed(self.free_ways)
 
     def _repair(
         self,

@@ -5,6 +5,9 @@ before a wall reads what it never reads elsewhere, as one of a rangefinder's ray
 shortest. A threshold on one reading carries over to places that no log saw; a function of them all
 is less right there.
 
+Where a log never came up to a wall in a direction, the reading that points there says how far the
+way goes on.
+
 A direction is one end of a dimension of the actions: 2 a the low one, 2 a + 1 the high one.
 """
 
@@ -12,6 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rfl_torch.free_ways import FreeWays, ways
 
 Array = NDArray[np.float64]
 
@@ -26,6 +31,10 @@ FEWEST = 10
 
 MOST_WRONG = 0.05
 """Steps that a threshold may tell wrongly, as a share of those that were stopped."""
+
+LEAST_FREE = 1.0
+"""Full actions that a way must be free for where no log came up to a wall: what the reading says of
+so little is not right to a half, and who takes a wall for a free way counts on into it."""
 
 
 class Contact(NamedTuple):
@@ -52,6 +61,19 @@ class Contact(NamedTuple):
         if not len(says) or (says.any() and not says.all()):
             return None
         return bool(says[0])
+
+    def completed(self, free_ways: FreeWays) -> "Contact":
+        """With directions of which nothing is known by the readings that point along them."""
+        threshold, side = self.threshold.copy(), self.side.copy()
+        along = ways(len(side) // 2)
+        for direction in np.flatnonzero(~side.any(1)):
+            (way,) = np.flatnonzero(along[:, direction // 2] == 2.0 * (direction % 2) - 1.0)
+            if free_ways.carries_over[way]:
+                reading = free_ways.weight[:-1, way].argmax()
+                over = LEAST_FREE - free_ways.weight[-1, way]
+                threshold[direction, reading] = over / free_ways.weight[reading, way]
+                side[direction, reading] = -1.0
+        return Contact(threshold, side)
 
 
 def learn_contact(

@@ -4,7 +4,9 @@ A robot that is off its map knows nothing of the room but what it sees. Its logs
 way looks like. A reading that falls by the same amount with every move along a way, wherever the
 robot is, points there, as one of a rangefinder's rays does; from its lowest value on it counts how
 far the way goes on, in places as well that no log saw. In a log of one corridor several readings
-fall so. Those that look past the way fall by more, in their own unit, than the one along it.
+fall so. Those that look past the way fall by more, in their own unit, than the one along it. If no
+log came near the end of one way, the reading that is left over and never shows less than its most
+is the one that points there.
 
 Where no reading does, free ways are a linear function of all, fitted to how far the track
 (`places`) itself went on from each place; a small network, more right where the logs were, is less
@@ -15,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from rfl_torch.innate import directions
@@ -45,6 +48,12 @@ FEWEST_MOVES = 50
 ALIKE, LEAST_ALIKE, NEARLY = 0.1, 0.3, 0.9
 """Share of the usual fall that a move's may be off for being alike; moves that must be alike for a
 reading to tell how far a way goes on; and share of the most alike that is as good."""
+
+NEVER = 10.0
+"""Cost of a reading that doesn't point along a way: above all others."""
+
+HIGHEST = 0.9
+"""Share of the sights in which what points along a way whose end is out of sight shows its most."""
 
 SLANT = 0.2
 """Logarithm of a fall by which it may be off what it should be along a way."""
@@ -149,7 +158,9 @@ def readings_ahead(
     """
     moved, changed = _moves(tracks, observations)
     along = ways(moved.shape[1])
-    fall = np.stack([_fall(moved, changed, way) for way in along])
+    fall, alike = (
+        np.stack(part) for part in zip(*(_fall(moved, changed, way) for way in along), strict=True)
+    )
     # Along its own way a reading falls by what a full action is in its unit; one that points past
     # it, by more. A slanted way's full action is made of those along the axes.
     own = np.where(fall > 0, fall * scale, np.inf)
@@ -160,8 +171,27 @@ def readings_ahead(
     is_known = np.isfinite(own) & np.isfinite(expected)
     share = np.divide(own, expected, where=is_known, out=np.full(own.shape, np.inf))
     off = np.abs(np.log(share))
-    reading = np.where(off.min(1) <= SLANT, off.argmin(1), -1)
-    return reading, fall[np.arange(len(along)), reading]
+    # Along a corridor several readings fall as they should along a slanted way, and all but one of
+    # them less surely; that one may be as good for another way: each points along one.
+    cost = np.where(off <= SLANT, off + 1.0 - alike, NEVER)
+    reading = np.full(len(along), -1)
+    way, best = linear_sum_assignment(cost)
+    is_told = cost[way, best] < NEVER
+    reading[way[is_told]] = best[is_told]
+    fall = fall[np.arange(len(along)), reading]
+    # No log came near the end of the one way left: what points there stayed at its highest.
+    (left,) = np.nonzero(reading < 0)
+    spare = np.setdiff1d(_at_their_highest(observations), reading)
+    if len(left) == len(spare) == 1 and np.isfinite(expected[left[0]]).all():
+        reading[left], fall[left] = spare, expected[left, 0] / scale[spare]
+    return reading, fall
+
+
+def _at_their_highest(observations: list[Array]) -> NDArray[np.int64]:
+    """Readings that hardly ever showed less than the most that they can."""
+    seen = np.concatenate(observations)
+    (always,) = np.nonzero((seen == seen.max(0)).mean(0) >= HIGHEST)
+    return always
 
 
 def _moves(tracks: list[Array], observations: list[Array]) -> tuple[Array, Array]:
@@ -177,20 +207,23 @@ def _moves(tracks: list[Array], observations: list[Array]) -> tuple[Array, Array
     return np.concatenate(moved), np.concatenate(changed)
 
 
-def _fall(moved: Array, changed: Array, way: Array) -> Array:
-    """By how much each reading falls in a full action along a way, (D,); 0 if it doesn't tell."""
+def _fall(moved: Array, changed: Array, way: Array) -> tuple[Array, Array]:
+    """By how much each reading falls in a full action along a way, (D,); 0 if it doesn't tell.
+
+    And in which share of the moves that it changes in it falls so, (D,): what is at its highest
+    says that nothing is near, and doesn't change.
+    """
     length = np.linalg.norm(moved, axis=1)
     is_along = moved @ way >= COURSE * length
     each = -changed[is_along] / length[is_along, None]
-    usual = np.zeros(changed.shape[1])
+    usual, alike = np.zeros(changed.shape[1]), np.zeros(changed.shape[1])
     for reading, fall in enumerate(each.T):
-        does_change = fall != 0
-        if does_change.sum() >= FEWEST_MOVES:
-            usual[reading] = max(0.0, float(np.median(fall[does_change])))
-    if not usual.any():
-        return usual
-    alike = np.where(usual > 0, (np.abs(each - usual) <= ALIKE * usual).mean(0), 0.0)
-    return np.where(alike >= max(LEAST_ALIKE, NEARLY * alike.max()), usual, 0.0)
+        fall = fall[fall != 0]
+        if len(fall) >= FEWEST_MOVES and (median := float(np.median(fall))) > 0:
+            usual[reading] = median
+            alike[reading] = (np.abs(fall - median) <= ALIKE * median).mean()
+    tells = alike >= max(LEAST_ALIKE, NEARLY * alike.max())
+    return np.where(tells, usual, 0.0), alike
 
 
 def _gone_over(position: Array, chosen: NDArray[np.int64], along: Array) -> Array:

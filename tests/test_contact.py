@@ -3,7 +3,7 @@ import pytest
 
 from rfl_torch.contact import FEWEST, Contact, _best_threshold, learn_contact
 from rfl_torch.explorer import Explorer
-from rfl_torch.free_ways import LONGEST, FreeWays
+from rfl_torch.free_ways import LONGEST, FreeWays, ways
 
 BOUNDS = (np.full(2, -1.0, np.float32), np.ones(2, np.float32))
 
@@ -54,6 +54,25 @@ def test_walls_are_felt_in_a_room_that_no_log_saw():
             assert (low, high) == ((True, False) if wall == 0.0 else (False, True))
             low, high = says_at(contact, (along, wall), large)[2:]
             assert (low, high) == ((True, False) if wall == 0.0 else (False, True))
+
+
+def test_a_wall_that_no_log_came_up_to_is_felt_by_the_reading_that_points_there():
+    """Here the high end of the second dimension; a reading's whole range is IN_SIGHT."""
+    weight = np.zeros((5, 8))
+    known = FreeWays(weight.copy(), 0.0)
+    (up,) = np.flatnonzero((ways(2) == (0.0, 1.0)).all(1))
+    weight[3, up] = IN_SIGHT
+    felt = learn_contact(*walk((12.0, 20.0)))
+    felt.side[3] = 0.0
+    assert says_at(felt, (30.0, 60.0), (60.0, 60.0))[3] is None
+    assert (
+        says_at(felt.completed(known), (30.0, 60.0), (60.0, 60.0))[3] is None
+    )  # none points there
+    completed = felt.completed(FreeWays(weight, 0.0))
+    for away, is_blocked in ((0.0, True), (0.9, True), (1.1, False), (30.0, False)):
+        says = says_at(completed, (30.0, 60.0 - away), (60.0, 60.0))
+        assert says == [False, False, False, is_blocked]
+    np.testing.assert_array_equal(completed.side[:3], felt.side[:3])  # what was felt is as it was
 
 
 def test_what_tells_in_a_corridor_alone_leaves_it_unclear_elsewhere():

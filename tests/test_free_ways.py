@@ -97,6 +97,31 @@ def test_in_a_corridor_the_ray_ahead_is_told_from_those_that_fall_as_evenly():
     np.testing.assert_allclose(fall[towards] * seen.max(0)[[0, 12]], 1.0, rtol=1e-6)
 
 
+@pytest.mark.parametrize("length", [60.0, 2000.0])
+def test_a_way_whose_end_the_log_hardly_saw_or_never_is_told_by_the_ray_along_it(length):
+    """And slanted ways, along which rays to both ends of a wall fall, by one ray each."""
+    track, _, shift, actions = walk()
+    size, sight = np.array([length, SIZE[1]]), 30.0
+    seen = rays(track, 24, size).clip(max=sight) / sight
+    assert (seen[:, 0] == 1.0).mean() > 0.7  # where falls that don't show count, it is told by none
+    learned = learn(track, seen, shift, actions, scale=sight)
+    for way, along in enumerate(ways(2)):
+        ahead = int(np.round(np.arctan2(along[1], along[0]) / (2 * np.pi) * 24)) % 24
+        assert np.flatnonzero(learned.weight[:-1, way]).tolist() == [ahead]
+        np.testing.assert_allclose(learned.weight[ahead, way], sight, rtol=0.1)
+
+
+def test_of_a_corridor_of_which_no_end_was_seen_no_reading_is_left_for_one_way_alone():
+    track, _, shift, actions = walk()
+    middle = track + np.array([1000.0, 0.0])
+    seen = rays(middle, 8, np.array([2000.0, SIZE[1]])).clip(max=30.0) / 30.0
+    assert (seen[:, [0, 4]] == 1.0).all()
+    learned = learn(middle, seen, shift, actions, scale=30.0)
+    told = learned.carries_over
+    assert told[[way_along(0, 1), way_along(0, -1)]].all()
+    assert not told[[way_along(1, 0), way_along(-1, 0)]].any()
+
+
 def test_a_way_that_no_reading_points_along_is_told_by_all():
     learned = learn(*walk())  # it reads along the axes only
     is_axis = (ways(2) == 0).any(1)
