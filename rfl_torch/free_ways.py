@@ -158,9 +158,7 @@ def readings_ahead(
     """
     moved, changed = _moves(tracks, observations)
     along = ways(moved.shape[1])
-    fall, alike = (
-        np.stack(part) for part in zip(*(_fall(moved, changed, way) for way in along), strict=True)
-    )
+    fall = np.stack([_fall(moved, changed, way) for way in along])
     # Along its own way a reading falls by what a full action is in its unit; one that points past
     # it, by more. A slanted way's full action is made of those along the axes.
     own = np.where(fall > 0, fall * scale, np.inf)
@@ -171,9 +169,9 @@ def readings_ahead(
     is_known = np.isfinite(own) & np.isfinite(expected)
     share = np.divide(own, expected, where=is_known, out=np.full(own.shape, np.inf))
     off = np.abs(np.log(share))
-    # Along a corridor several readings fall as they should along a slanted way, and all but one of
-    # them less surely; that one may be as good for another way: each points along one.
-    cost = np.where(off <= SLANT, off + 1.0 - alike, NEVER)
+    # Along a corridor rays to both ends of a wall fall as they should along one slanted way, but
+    # only one of them does so along the other: each tells one, and all together are told best.
+    cost = np.where(off <= SLANT, off, NEVER)
     reading = np.full(len(along), -1)
     way, best = linear_sum_assignment(cost)
     is_told = cost[way, best] < NEVER
@@ -207,11 +205,10 @@ def _moves(tracks: list[Array], observations: list[Array]) -> tuple[Array, Array
     return np.concatenate(moved), np.concatenate(changed)
 
 
-def _fall(moved: Array, changed: Array, way: Array) -> tuple[Array, Array]:
+def _fall(moved: Array, changed: Array, way: Array) -> Array:
     """By how much each reading falls in a full action along a way, (D,); 0 if it doesn't tell.
 
-    And in which share of the moves that it changes in it falls so, (D,): what is at its highest
-    says that nothing is near, and doesn't change.
+    Asked where it changes at all: at its highest it says that nothing is near.
     """
     length = np.linalg.norm(moved, axis=1)
     is_along = moved @ way >= COURSE * length
@@ -223,7 +220,7 @@ def _fall(moved: Array, changed: Array, way: Array) -> tuple[Array, Array]:
             usual[reading] = median
             alike[reading] = (np.abs(fall - median) <= ALIKE * median).mean()
     tells = alike >= max(LEAST_ALIKE, NEARLY * alike.max())
-    return np.where(tells, usual, 0.0), alike
+    return np.where(tells, usual, 0.0)
 
 
 def _gone_over(position: Array, chosen: NDArray[np.int64], along: Array) -> Array:
