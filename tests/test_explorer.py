@@ -155,6 +155,18 @@ def test_a_cell_is_new_beyond_a_gap_around_those_that_were_entered(gap):
     assert len(way) == abs(way[-1][1]) == gap + 1
 
 
+def test_an_agent_feels_a_wall_in_a_direction_in_which_its_log_met_none():
+    """Upwards, where the way is told by the reading that points there."""
+    _, agent = learned()
+    with gym.make("rfl/RangefinderMaze-v0", layout="paper") as env:
+        before_the_wall, amid = (
+            agent.readings.normalize(env.reset(options={"position": (900.0, y)})[0])
+            for y in (570.0, 500.0)
+        )
+    assert agent.contact.is_blocked(3, before_the_wall) is True
+    assert agent.contact.is_blocked(3, amid) is False
+
+
 def test_who_completes_a_map_finds_something_new_nearer_than_who_is_lost():
     log, agent = learned()
     seen = agent.readings.normalize(log.observations[3000])
